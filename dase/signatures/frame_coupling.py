@@ -34,8 +34,10 @@ class CouplingSettings:
     usual: float = 0.02  # [s] its median is the usual rate: longer than a burst, shorter than a scene
     shortest: float = 0.014  # [s] what repeats sooner is a lamp: it has 100 or 120 cycles per second
     margin: float = 0.003  # [s] left out on both sides of a burst
+    most_margin: float = 0.1  # share of the interval, so that short ones keep time between their bursts
     tiles: float = 0.4  # share of the active tiles that take part in a burst of the whole array
     lamp: float = 0.5  # peaks this high relative to the highest, evenly over the frame, belong to a lamp
+    wide: float = 0.25  # share of the interval above which a burst is light that swings: a sine rises for half
 
 
 @dataclass(frozen=True)
@@ -122,8 +124,14 @@ def _fold(
 
 
 def _is_lamp(mean: NDArray[np.float64], at: int, step: float, s: CouplingSettings) -> bool:
-    """Whether the rate over a frame has the same peak at even distances: light whose cycles fit into it."""
+    """Whether the rate over a frame is that of light that swings.
+
+    It has the same peak at even distances, where several cycles fit into the frame, or rises for a good part
+    of the frame, where one does. Bursts of real cameras last 2 to 3 ms.
+    """
     length = len(mean)
+    if (mean > 0.5 * mean[at]).mean() > s.wide:
+        return True
     wide = maximum_filter1d(mean, 5, mode="wrap")
     for cycles in range(2, int(length * step / 0.0025) + 1):
         mates = (at + np.round(np.arange(1, cycles) * length / cycles).astype(int)) % length
@@ -309,7 +317,7 @@ def _describe_bursts(
         if high.any():
             at = int(fold.mean.argmax())
             peaks["ON" if polarity else "OFF"] = (at + 0.5) * step
-    margin = round(s.margin / step)
+    margin = round(min(s.margin, s.most_margin * interval) / step)
     wide = maximum_filter1d(bursty, 2 * margin + 1, mode="wrap")
     edges = np.flatnonzero(np.diff(np.concatenate(([False], wide, [False])).astype(np.int8)))
     spans = edges.reshape(-1, 2).astype(np.float64) * step

@@ -95,6 +95,14 @@ def test_frequency_and_swing_of_a_lamp():
     assert entry.sentence.startswith("light at 100.")
 
 
+@pytest.mark.parametrize("frequency", [50.0, 60.0])
+def test_a_lamp_as_slow_as_frames_is_no_burst(frequency):
+    """Most pixels send once a swing, near its end: it looks like bursts, but wide ones."""
+    looked = dase.find_signatures(made(kind="objects", flicker={"frequency": frequency, "depth": 0.2}))
+    assert not looked["frame coupling"].found
+    assert looked["flicker"].details["frequency"] == pytest.approx(frequency, abs=0.1)
+
+
 def test_noise_at_rest_shows_and_says_of_which_kind():
     still = made(kind="objects", shot={"rate": 3.0})
     entry = dase.find_signatures(still)["opposite pairs"]
