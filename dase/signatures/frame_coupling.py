@@ -37,7 +37,7 @@ class CouplingSettings:
     most_margin: float = 0.1  # share of the interval, so that short ones keep time between their bursts
     tiles: float = 0.4  # share of the active tiles that take part in a burst of the whole array
     lamp: float = 0.5  # peaks this high relative to the highest, evenly over the frame, belong to a lamp
-    wide: float = 0.25  # share of the interval above which a burst is light that swings: a sine rises for half
+    wide: float = 0.25  # share of the interval above which a burst is light that swings: a sine takes half
 
 
 @dataclass(frozen=True)
