@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dase.diagnosis.frames_at_rest import events_where_frames_rest
+from dase.diagnosis.led_pixels import follow_the_light
 from dase.effects import EFFECTS, Effect
 from dase.effects.made_signatures import makers_of, told_by
 from dase.effects.threshold import Threshold
@@ -33,6 +34,7 @@ from dase.signatures.kinds import (
     FIXED_PATTERN,
     FLICKER,
     FRAME_COUPLING,
+    HOT_PIXELS,
     KINDS,
     NOISE_AT_REST,
     OPPOSITE_PAIRS,
@@ -221,6 +223,7 @@ def find_seen_effects(measurement: Measurement, library: Mapping[str, type[Effec
     entries = tuple(
         slowest_image(entry, step or 0.0) for entry in found.found
         if not _is_of_frames(entry, step or 0.0, events, scene) and not _is_tone_of_clip(entry, clip_step)
+        and not _are_led(entry, events, scene)
     )  # fmt: skip
     coupling = [entry for entry in entries if entry.name == FRAME_COUPLING]
     bursts = None
@@ -248,6 +251,13 @@ def _is_of_frames(entry: Signature, step: float, events: Events, scene: Scene) -
         return True  # of noise that is drawn once a frame, or of pixels that send some time after each
     tick = said.get("step", period)
     return ticks_are_of_frames(tick, step, events, scene)
+
+
+def _are_led(entry: Signature, events: Events, scene: Scene) -> bool:
+    """Return whether hot pixels send with their light; between a camera's frames that is a guess."""
+    if entry.name != HOT_PIXELS or isinstance(scene, CameraScene):
+        return False
+    return follow_the_light(entry, events, scene)
 
 
 def _is_tone_of_clip(entry: Signature, step: float) -> bool:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from os import PathLike
 from pathlib import Path
 from typing import Unpack
@@ -232,11 +233,15 @@ def find_signatures(
     for part in passes.parts(chunk, progress):
         second.push(part)
     second.finish()
-    hot, hot_pixels = find_hot_pixels(
-        second.calm, second.quiet.share(first.end), duration, each, lamp=lamp.frequency if lamp else 0.0
-    )
+    look_for_hot = partial(
+        find_hot_pixels, second.calm, second.quiet.share(first.end), duration, each,
+        lamp=lamp.frequency if lamp else 0.0,
+    )  # fmt: skip
+    hot, hot_pixels = look_for_hot()
     stamps = find_time_stamps(first.first_events(), hot_pixels, each, lamp=lit)
     tick = max(stamps.details.get(name, 0.0) for name in ("step", "period")) if stamps.found else 0.0
+    if tick and not hot.found:
+        hot, hot_pixels = look_for_hot(tick=tick)
     entries = (
         coupling,
         flicker,

@@ -38,6 +38,7 @@ class HotSettings:
     asked: int = 100  # pixels at most that are asked for a tone in common
     tones: ToneSettings = LAMPS
     in_common: float = 1e-3  # chance of a tone below which pixels have it in common
+    apart: float = 2.0  # cycles over all of the time that a tone has more or less than the ticks of a clock
     overtones: int = 4  # a pixel with a low threshold sends several times in a cycle
     border: int = 2  # pixels from the edge: what passes outside nobody sees, and there it looks calm
     calm: float = 0.05  # share of places and times in which a hot pixel would have been seen alone
@@ -80,8 +81,8 @@ class CalmCounts:
         return [(t[place == one], sign[place == one]) for one in pixels]
 
 
-def _tone_in_common(trains: Sequence[tuple[Array, Array]], s: HotSettings) -> float:
-    """Return the tone [Hz] that pixels have in common, 0 where there is none.
+def _tone_in_common(trains: Sequence[tuple[Array, Array]], tick: float, s: HotSettings) -> float:
+    """Return the tone [Hz] that pixels have in common, and not of ticks of `tick` [s], 0 where there is none.
 
     Noise of a pixel knows nothing of the others'. Light that swings, be it in a corner of the view, is
     followed by pixels with low thresholds alone, in one rhythm. Rayleigh statistics of independent pixels add
@@ -96,6 +97,9 @@ def _tone_in_common(trains: Sequence[tuple[Array, Array]], s: HotSettings) -> fl
     tones, sums = swings(trains, begin, span, s.tones)
     power = sums**2 / np.array([[len(t)] for t, _ in trains])
     others = power.sum(0) - power.max(0)
+    cycles = tones * tick
+    of_ticks = (cycles > 0.5) & (np.abs(cycles - np.round(cycles)) < s.apart * tick / span)
+    others = np.where(of_ticks, 0.0, others)
     best = int(others.argmax())
     if s.tones.independent(span) * stats.gamma.sf(others[best], len(trains) - 1) > s.in_common:
         return 0.0
@@ -128,7 +132,9 @@ def _is_led(t: Array, sign: Array, tones: Array, s: HotSettings) -> bool:
     return most >= s.of_its_own * float(own.max(initial=0.0))
 
 
-def _led_pixels(calm: CalmCounts, chance: Array, lamp: float, s: HotSettings) -> NDArray[np.int64]:
+def _led_pixels(
+    calm: CalmCounts, chance: Array, lamp: float, tick: float, s: HotSettings
+) -> NDArray[np.int64]:
     """Return the pixels that stand out by following light that swings, row-major, shape (K,).
 
     Where that are half of those that stand out, all are in doubt; of fewer a rhythm in common tells nothing,
@@ -138,12 +144,13 @@ def _led_pixels(calm: CalmCounts, chance: Array, lamp: float, s: HotSettings) ->
         calm: The calm events.
         chance: Of as many of an ordinary pixel, shape (H * W,).
         lamp: A frequency that is known [Hz], or 0.
+        tick: Of the time stamps [s], or 0.
         s: What makes a pixel hot.
     """
     out = np.flatnonzero(chance < s.chance / len(chance))
     out = out[np.argsort(chance[out], kind="stable")]
     trains = calm.first_of(out, s.tones.span)
-    tone = lamp or _tone_in_common(trains[: s.asked], s)
+    tone = lamp or _tone_in_common(trains[: s.asked], tick, s)
     if not tone:
         return out[:0]
     led = _follow(trains, tone, s)
@@ -191,6 +198,7 @@ def find_hot_pixels(
     level: float,
     *,
     lamp: float = 0.0,
+    tick: float = 0.0,
     settings: HotSettings | None = None,
 ) -> tuple[Signature, NDArray[np.bool_]]:
     """Look for pixels that send by themselves.
@@ -201,6 +209,8 @@ def find_hot_pixels(
         duration: Of the recording [s].
         level: p below which there are any.
         lamp: Frequency of light that flickers [Hz]; 0 where none was found.
+        tick: From one time stamp that there may be to the next, of any pixel [s]; 0 where none was found: in
+            step with that are all pixels, whatever makes them send.
         settings: What makes a pixel hot.
 
     Returns:
@@ -213,7 +223,7 @@ def find_hot_pixels(
     steady = calm.halves.min(0) >= np.maximum(2, s.share * total)
     alone = steady & (total >= s.ratio * usual) & _has_all_neighbours(calm.width, calm.height, s.border)
     pixels = len(chance)
-    led = _led_pixels(calm, np.where(alone, chance, 1.0), lamp, s)
+    led = _led_pixels(calm, np.where(alone, chance, 1.0), lamp, tick, s)
     follow = len(led)
     alone[led] = False
     chance = np.where(alone, chance, 1.0)

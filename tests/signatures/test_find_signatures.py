@@ -197,6 +197,14 @@ def test_pixels_that_follow_a_lamp_which_is_not_found_are_not_hot(plain, rhythm,
     assert ("follow light" in looked["hot pixels"].sentence) != there
 
 
+def test_hot_pixels_that_are_read_in_rows_follow_no_lamp():
+    """In step with the scan all are, and each has one polarity: that looked like light that swings."""
+    hot = {"share": 0.003, "rate": 150.0, "balance": 0.97}
+    looked = dase.find_signatures(made(kind="objects", hot=hot, row_scan={"line": 3e-5}))
+    assert looked["time stamps"].found
+    assert looked["hot pixels"].found
+
+
 @pytest.mark.parametrize("seed", [1, 14, 36])
 def test_pixels_that_send_at_even_times_of_their_own_follow_no_lamp(plain, seed):
     """Seen while all around them rests, some cycles at a time, they are near an overtone of two of them."""
