@@ -143,10 +143,27 @@ class SeenEffects:
             if entry.name == NOISE_AT_REST or len(self.named_by(entry)) > 1:
                 out = self._with_either(entry, out)
                 continue
-            for name in self.named_by(entry) or (entry.name,):
+            named_here = self.named_by(entry)
+            if not named_here:
+                out = self._with_only_maker(entry, out)
+            for name in named_here or (entry.name,):
                 out = [one for one in out if one.effect != name]
                 out.append(Finding(name, Grade.CERTAIN, seen=entry.sentence))
         return out
+
+    def _with_only_maker(self, entry: Signature, findings: list[Finding]) -> list[Finding]:
+        """Return findings with the only effect that is known to make what is seen, or what is not known.
+
+        Args:
+            entry: What is seen, which names no effect.
+            findings: In which none that makes it is announced.
+        """
+        makers = tuple(makers_of(entry.name, self._known))
+        offered = {name for one in findings for name in one.alternatives if one.grade is Grade.EITHER}
+        offered |= {one.effect for one in findings if one.grade is Grade.EITHER}
+        if len(makers) != 1 or makers[0] not in self.library or makers[0] in offered:
+            return findings
+        return self._with_either(entry, findings)
 
     def _names(self, name: str) -> bool:
         """Whether a signature was seen and names effects of the library."""

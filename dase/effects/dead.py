@@ -8,7 +8,6 @@ from typing import ClassVar
 import warp as wp
 
 from dase.effects.base import Effect, parameter
-from dase.effects.made_signatures import Makes
 
 
 @wp.func
@@ -29,7 +28,7 @@ class Dead(Effect):
     source: ClassVar[str] = "Gallego et al.: Event-based vision, a survey, 2022 (non-idealities)"
     stages: ClassVar = {"gate": silence_pixel}
     rare: ClassVar[bool] = True
-    signatures: ClassVar = (Makes("fixed pattern"),)
+    signatures: ClassVar = ()
 
     share: float = parameter(
         0.001,

@@ -67,6 +67,22 @@ class HeldClipSettings:
     """Share of those events at such parts from which on nothing is held, where events are spread: 0.56 to
     0.73 in clips of v2e with a dead time, which send the first of many; 0.01 and 0.04 of IEBCS."""
 
+    many: int = 22
+    """Such parts, at most, where all events come soon after a frame: the first of many after a dead time."""
+
+    past: float = 0.045
+    """Times after a frame, relative to that to the next, from which on so many are told from others."""
+
+    all_at_parts: float = 0.8
+    """Share of those events at such parts from which on nothing is held, where all come soon after a frame:
+    chance has 0.4 of them there."""
+
+    kinds: int = 4
+    """How many different parts these are of, at least: what is held comes at one time after a frame."""
+
+    used: float = 0.02
+    """Share of those events that are of one, from which on it counts."""
+
     tick: float = 0.02
     """Of a frame before its end: rounded stamps of the next frame's time."""
 
@@ -120,6 +136,12 @@ def holds_frames(events: Events, scene: Scene, settings: HeldClipSettings = HELD
     clear = phase > settings.clear
     if begin is None or (spread and even[clear].mean() >= settings.at_parts):
         return False
+    past = phase > settings.past
+    fine = (parts <= settings.many) & (np.abs(late * parts - gap) < 1.1e-6 * parts)
+    if not spread and past.any() and fine[past].mean() >= settings.all_at_parts:
+        used = np.bincount(parts[past & fine].astype(np.int64)) / np.count_nonzero(past)
+        if np.count_nonzero(used > settings.used) >= settings.kinds:
+            return False  # a dead time leaves the first of many
     if settings.late[0] < begin < settings.late[1]:
         return True
     # at about the time of a frame it may be this one or the next of which they tell

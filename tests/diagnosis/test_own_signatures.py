@@ -65,11 +65,24 @@ def test_one_that_does_not_say_may_make_what_is_seen_beside_a_model(name):
 
 def test_what_it_explains_is_not_said_again():
     entry, sure = entry_of("fixed pattern"), Finding("own", Grade.SUPPORTED)
-    for makes, said in (((Makes("fixed pattern"),), ["own"]), ((), ["own", "fixed pattern"])):
+    of_two, of_one = ["own"], ["own", "mismatch", "fixed pattern"]
+    for makes, said in (((Makes("fixed pattern"),), of_two), ((), of_one)):
         seen = SeenEffects((entry,), library=EFFECTS | own_beside(makes=makes))
         assert [one.effect for one in seen.findings([sure], ())] == said
         given = [one.effect for one in seen.findings([], ("own",))]
         assert given == said[1:]
+
+
+def test_the_only_one_that_makes_a_pattern_is_offered():
+    entry = entry_of("fixed pattern")
+    offered, certain = SeenEffects((entry,)).findings([], ())
+    assert (offered.effect, offered.grade, offered.unknown) == ("mismatch", Grade.EITHER, True)
+    assert (certain.effect, certain.grade) == ("fixed pattern", Grade.CERTAIN)
+    # of two nothing tells which, and what is offered already is not offered twice
+    two = SeenEffects((entry,), library=EFFECTS | own_beside(makes=(Makes("fixed pattern"),)))
+    assert [one.effect for one in two.findings([], ())] == ["fixed pattern"]
+    beside = Finding("jitter", Grade.EITHER, ("mismatch",))
+    assert SeenEffects((entry,)).findings([beside], ())[:-1] == [beside]
 
 
 def test_its_noise_may_come_in_either_way():

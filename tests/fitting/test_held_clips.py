@@ -65,6 +65,25 @@ def test_events_before_their_light_are_of_a_clip_that_holds_frames(scene, late):
     np.testing.assert_array_equal(again.scene.sample_times(), measured.scene.sample_times())
 
 
+def test_the_first_of_many_events_is_not_early(scene):
+    """After a long dead time a simulator that puts n events of a frame evenly into it sends the first."""
+    times = scene.sample_times()
+    rng = np.random.default_rng(3)
+    frame = np.sort(rng.integers(2, len(times) - 2, 6000))
+    gap = times[frame + 1] - times[frame]
+    x, y = rng.integers(0, WIDTH, len(frame)), rng.integers(0, HEIGHT, len(frame))
+    light = scene.frames(times)
+    rises = light[frame + 1, y, x] > light[frame, y, x]
+
+    def sent(late):
+        t = np.floor(1e6 * (times[frame] + late * gap)) / 1e6
+        order = np.argsort(t, kind="stable")
+        return Events(t[order], x[order], y[order], rises[order], WIDTH, HEIGHT)
+
+    assert not holds_frames(sent(1 / rng.integers(11, 21, len(frame))), scene)
+    assert holds_frames(sent(rng.uniform(1 / 20, 1 / 11, len(frame)) + 0.1), scene)
+
+
 def test_a_frame_at_its_own_time_is_not_early(scene):
     events = held_frames(scene, early=False)
     assert not holds_frames(events, scene)
