@@ -47,6 +47,7 @@ from dase.fitting.scene_doubt import with_scene_doubt
 from dase.probes.random_streams import SimulationStream
 from dase.probes.stimulus import Trust
 from dase.results import Diagnosis, Progress, is_worse
+from dase.scenes.grey_steps import grey_step_of
 from dase.signatures.kinds import DEAD_TIME, UNEQUAL_THRESHOLDS
 from dase.simulation.sensor import Sensor
 from dase.simulation.sensor_file import as_sensor
@@ -171,7 +172,8 @@ def _begin_search(
     task = DiagnosisTask(
         evidence, compared.candidates(effects), compared.seed, tell,
         frozenset(effect.name for effect in given.effects), settings,
-        frame_held=compared.measurement.held, all_time=all_time,
+        frame_held=compared.measurement.held, grey_step=grey_step_of(compared.measurement.scene),
+        all_time=all_time,
     )  # fmt: skip
     return DiagnosisState(task, notes=notes), given, free
 

@@ -128,7 +128,7 @@ def grade_effects(
             is_strained(model, *one)
             or is_between_samples(model, *one, shortest=shortest)
             or is_small_beside_another(model, *one)
-            or is_below_black(model, *one)
+            or is_below_black(model, *one, grey=settings.black_greys * task.grey_step)
             for one in mine[name].items()
         )
         if grade is Grade.SUPPORTED and doubtful:
@@ -209,16 +209,22 @@ def is_small_beside_another(model: FittedModel, name: str, value: Estimate) -> b
     )
 
 
-def is_below_black(model: FittedModel, name: str, value: Estimate) -> bool:
+def is_below_black(model: FittedModel, name: str, value: Estimate, *, grey: float = 0.0) -> bool:
     """Return whether an intensity is below what the logarithm adds to black: what black is nobody knows.
 
     A simulator adds a constant of its own there, such as one of 10,000 grey values, which acts in the darkest
-    pixels as a dark current does.
+    pixels as a dark current does. So does the rounding of a clip to 8 bits, up to a few greys.
+
+    Args:
+        model: Has the parameter.
+        name: Of the parameter.
+        value: Its estimate.
+        grey: Below which the clip does not tell it either [intensity].
     """
     fact = next((axis.fact for axis in model.space.axes if axis.name == name), None)
     if fact is None or fact.off is None or fact.unit != "intensity":
         return False
-    return value.high < model.sensor.log_eps
+    return value.high < max(model.sensor.log_eps, grey)
 
 
 def grade_of(

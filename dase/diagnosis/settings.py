@@ -147,6 +147,10 @@ class GradeSettings:
     """Error that true models have in the median; what is left is what is above it, or above the level of
     chance where that is higher."""
 
+    black_greys: float = 3.0
+    """Greys of a clip of 8 bits below which it does not tell what black is: knees of 1.0 and 2.2 greys were
+    supported in clips of a simulator without any."""
+
     far_off: float = 1.6
     """Times by which last steps of a model's parameters could lower its error, at most."""
 

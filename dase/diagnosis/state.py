@@ -33,6 +33,7 @@ class DiagnosisTask:
         given: Names of the effects that a model has before the search.
         settings: Numbers by which effects are added and dropped.
         frame_held: Time for which each frame of a clip is held [s], see `Measurement.held`.
+        grey_step: Between two greys of a clip of 8 bits [intensity]; 0 of other scenes.
         all_time: Whether all of the time is fitted, not its first part alone.
     """
 
@@ -43,6 +44,7 @@ class DiagnosisTask:
     given: frozenset[str]
     settings: DiagnosisSettings = DEFAULTS
     frame_held: float = 0.0
+    grey_step: float = 0.0
     all_time: bool = False
 
     def judge(self, model: FittedModel, *, repeats: int | None = None) -> Judgement:

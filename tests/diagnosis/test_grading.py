@@ -38,6 +38,7 @@ from dase.fitting.model import model_of
 from dase.probes.distance import Judgement
 from dase.results import Estimate, Finding, Grade
 from dase.scenes.between_frames import CameraScene
+from dase.scenes.grey_steps import grey_step_of
 from dase.scenes.video import VideoScene
 from dase.signatures.result import Answer, Signature
 from dase.simulation.sensor import Sensor
@@ -374,6 +375,18 @@ def test_a_dark_current_below_what_the_logarithm_adds_is_in_doubt():
     assert not is_below_black(model, "dark.current", more)
     assert not is_below_black(model, "dark.spread", little)
     assert not is_below_black(model, "threshold.on", little)
+    assert is_below_black(model, "dark.current", more, grey=2e-3)
+
+
+def test_a_clip_of_few_greys_says_so():
+    light = np.linspace(0, 1, 5 * 40).reshape(5, 8, 5).astype(np.float32)
+    times = np.arange(5) * 1e-3
+    assert grey_step_of(VideoScene(np.rint(255 * light).astype(np.float32) / 255, times)) == pytest.approx(
+        1 / 255, rel=1e-3
+    )
+    many = np.random.default_rng(0).random((5, 16, 24)).astype(np.float32)
+    assert grey_step_of(VideoScene(many, times)) == 0
+    assert grey_step_of(VideoScene(np.full((5, 4, 4), 0.5, np.float32), times)) == 0
 
 
 def test_what_includes_an_effect_is_its_rival_where_something_unknown_may_look_like_it():

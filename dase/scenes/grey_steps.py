@@ -1,0 +1,24 @@
+"""In which steps the greys of a clip come."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from dase.scenes.scene import Scene
+from dase.scenes.video import VideoScene
+
+MOST_GREYS = 256
+"""Greys of a clip of 8 bits; one of more tells black well enough."""
+
+
+def grey_step_of(scene: Scene) -> float:
+    """Return the least step between greys of a clip [intensity], as in the dark; 0 where they are not few.
+
+    Args:
+        scene: Any; only clips have such steps.
+    """
+    if not isinstance(scene, VideoScene):
+        return 0.0
+    times = scene.sample_times()
+    values = np.unique(scene.frames(times[[0, len(times) // 2, -1]]))
+    return float(np.diff(values).min()) if 1 < len(values) <= MOST_GREYS else 0.0
