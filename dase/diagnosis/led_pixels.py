@@ -10,6 +10,7 @@ from scipy.ndimage import uniform_filter1d
 from dase.events import Events
 from dase.probes.stimulus import log_light_of
 from dase.scenes.scene import Scene
+from dase.signatures.calm_events import row_major_pixels
 from dase.signatures.result import Signature
 
 
@@ -63,8 +64,7 @@ def follow_the_light(
     if not len(places) or len(times) < 3:
         return False
     pixels = places[:, 1] * events.width + places[:, 0]
-    order = np.argsort(pixels)
-    light = log_light_of(scene, times, pixels[order].astype(np.int32), log_eps=settings.log_eps)
+    light = log_light_of(scene, times, pixels.astype(np.int32), log_eps=settings.log_eps)
     steps = np.diff(times)
     change = np.abs(np.diff(light, axis=0)) / steps[:, None]
     # events come in the time after the change
@@ -73,10 +73,9 @@ def follow_the_light(
     usual = steps @ change / steps.sum()
     relative = change / np.where(usual > 0, usual, 1.0)
     gain = np.log((1 - settings.alone) * np.where(usual > 0, relative, 1.0) + settings.alone)
-    row_major = events.y.astype(np.int64) * events.width + events.x
     column = np.full(events.width * events.height, -1, np.int64)
-    column[pixels[order]] = np.arange(len(pixels))
-    at = column[row_major]
+    column[pixels] = np.arange(len(pixels))
+    at = column[row_major_pixels(events)]
     known = (at >= 0) & (events.t >= times[0]) & (events.t < times[-1])
     step = np.searchsorted(times, events.t[known], side="right") - 1
     more = np.bincount(at[known], gain[step, at[known]], minlength=len(pixels))

@@ -20,5 +20,5 @@ def grey_step_of(scene: Scene) -> float:
     if not isinstance(scene, VideoScene):
         return 0.0
     times = scene.sample_times()
-    values = np.unique(scene.frames(times[[0, len(times) // 2, -1]]))
+    values = np.unique(scene.frames(times[sorted({0, len(times) // 2, len(times) - 1})]))
     return float(np.diff(values).min()) if 1 < len(values) <= MOST_GREYS else 0.0
