@@ -9,6 +9,7 @@ from typing import Any, ClassVar
 import numpy as np
 import warp as wp
 from numpy.typing import NDArray
+from scipy.optimize import brentq
 
 from dase.effects.base import parameter
 from dase.effects.optics import SceneEffect, rendered_pictures
@@ -18,15 +19,20 @@ from dase.scenes.scene import Scene
 
 
 def blur_weights(sigma: float) -> NDArray[np.float32]:
-    """Return the discrete Gaussian of variance sigma² [px²]: middle, first neighbours and so on, (R + 1,).
+    """Return samples of a Gaussian with variance sigma² [px²]: middle, first neighbours and so on, (R + 1,).
 
-    Its variance is exact however narrow it is, where samples of the normal density would fall short, and
-    two blurs make the blur of the sum of their variances (Lindeberg: Scale-space for discrete signals, 1990).
+    Their own variance is exact: below 0.7 px samples of the density of that width would fall short of it, so
+    those of a wider one are taken.
     """
-    turns = np.fft.fftfreq(1024)
-    line = np.fft.ifft(np.exp(sigma**2 * (np.cos(2 * np.pi * turns) - 1))).real
-    line = line[: math.ceil(4 * sigma) + 2]
-    return np.asarray(line / (2 * line.sum() - line[0]), np.float32)
+    reach = np.arange(math.ceil(4 * sigma) + 3)
+
+    def line(width: float) -> NDArray[np.float64]:
+        density = np.exp(-0.5 * (reach / width) ** 2)
+        return np.asarray(density / (2 * density.sum() - density[0]))
+
+    narrowest = 0.05  # of which the first neighbours have nothing
+    width = brentq(lambda width: 2 * np.sum(line(width) * reach**2) - sigma**2, narrowest, sigma + 0.5)
+    return np.asarray(line(width), np.float32)
 
 
 class Unsharp(Scene):
