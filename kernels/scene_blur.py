@@ -103,12 +103,23 @@ def _blur_by_opencv(
     pictures: wp.array, weights: NDArray[np.float32], width: int, pixels: NDArray[np.int32], device: wp.Device
 ) -> wp.array:
     samples, size = pictures.shape
-    line = np.concatenate([weights[:0:-1], weights])
-    out = np.empty((samples, size), np.float32)
-    shape = samples, size // width, width
-    for picture, place in zip(pictures.numpy().reshape(shape), out.reshape(shape), strict=True):
-        cv2.sepFilter2D(picture, -1, line, line, dst=place, borderType=cv2.BORDER_REFLECT_101)
+    out = blur_pictures(pictures.numpy().reshape(samples, size // width, width), weights)
+    out = out.reshape(samples, size)
     every = len(pixels) == size and np.array_equal(pixels, np.arange(size))
     # NumPy chooses columns into memory that runs down them, and kernels read along rows
     chosen = out if every else np.ascontiguousarray(out[:, pixels])
     return wp.array(chosen, dtype=float, device=device, copy=False)
+
+
+def blur_pictures(pictures: NDArray[np.float32], weights: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return blurred pictures, shape (K, H, W), as `blur_frames` does, on the host.
+
+    Args:
+        pictures: Shape (K, H, W); continued by reflection about the outermost pixels.
+        weights: Of the middle, the first neighbours, the second neighbours and so on, shape (R + 1,).
+    """
+    line = np.concatenate([weights[:0:-1], weights])
+    out = np.empty_like(pictures)
+    for picture, place in zip(pictures, out, strict=True):
+        cv2.sepFilter2D(picture, -1, line, line, dst=place, borderType=cv2.BORDER_REFLECT_101)
+    return out

@@ -5,16 +5,21 @@ from __future__ import annotations
 from collections.abc import Callable
 from os import PathLike
 
+from dase.diagnosis.blurred_lens import behind_lens, best_width, error_of_choice
 from dase.diagnosis.candidates import calibrate_split, screen_and_descend
 from dase.diagnosis.settings import DEFAULTS
 from dase.effects import Effect
+from dase.effects.optics import SceneEffect
+from dase.effects.optics_blur import OpticsBlur
+from dase.errors import InputError
 from dase.fitting.data_split import SPLIT, ModelPremises, split_measurement
 from dase.fitting.fit import fit
-from dase.fitting.measurement import Measured, SceneChoice, as_measurement
+from dase.fitting.measurement import Measured, Measurement, SceneChoice, as_measurement
 from dase.fitting.model import fit_present_model
 from dase.probes.random_streams import SimulationStream
 from dase.probes.stimulus import Trust
 from dase.results import Fit
+from dase.scenes.video import VideoScene
 from dase.simulation.sensor import Sensor
 from dase.simulation.sensor_file import as_sensor
 
@@ -48,11 +53,16 @@ def fit_added(
 
     Returns:
         Held-out error of the sensor without the effect, fitted as well as it can be, and the fit with it.
+
+    Raises:
+        InputError: Measurement and scene do not fit, or what acts on pictures is no lens before a clip.
     """
     tell = progress or (lambda text, share, error: None)
     without = as_sensor(sensor)
-    measurement = as_measurement(measured, scene, trust)
+    measurement = as_measurement(measured, scene, trust).through_lens_of(without)
     without, effect = without.bound_to(measurement.scene), effect.bound_to(measurement.scene)
+    if isinstance(effect, SceneEffect):
+        effect = _as_lens_before_clip(effect, measurement)
     premises = ModelPremises(without.log_eps, unbroken=without.unbroken or effect.unbroken)
     evidence = split_measurement(measurement, models=premises, pixels=pixels, seed=seed, device=device)
     tell("fitting without the effect", 0.0, float("nan"))
@@ -61,6 +71,16 @@ def fit_added(
         evidence.report, repeats=DEFAULTS.repeats // 2, seed=SimulationStream.JUDGE.seed(seed)
     ).error
     tell(f"where to begin with {effect.name}", 0.1, before)
+    if isinstance(effect, OpticsBlur):
+
+        def left(width: float) -> float:
+            seen = behind_lens(measurement, width)
+            behind = split_measurement(seen, models=premises, pixels=pixels, seed=seed, device=device)
+            return error_of_choice(behind, fit_present_model(behind, without, None, seed=seed), seed=seed)
+
+        lens = OpticsBlur(sigma=best_width(left) or effect.sigma)
+        sensor = without.with_effect(lens)
+        return before, fit(measurement, sensor, pixels=pixels, seed=seed, device=device, progress=progress)
     # far from where it is, a descent could end in the wrong place
     calibrated = calibrate_split(
         evidence, present, repeats=DEFAULTS.repeats, scout_repeats=DEFAULTS.scout_repeats, seed=seed
@@ -68,3 +88,15 @@ def fit_added(
     start = screen_and_descend(calibrated, present, effect, seed=seed).model.sensor
     fitted = fit(measurement, start, pixels=pixels, seed=seed, device=device, progress=progress)
     return before, fitted
+
+
+def _as_lens_before_clip(effect: SceneEffect, measurement: Measurement) -> OpticsBlur:
+    """Return what acts on pictures as the lens before a clip that it has to be to be fitted."""
+    if not isinstance(effect, OpticsBlur):
+        raise InputError(f"{effect.name} acts on pictures, and cannot be fitted: add it without a recording")
+    if not isinstance(measurement.scene, VideoScene):
+        raise InputError(
+            f"{effect.name} can be fitted where the scene is a clip, which knows no lens: what else is known "
+            "of a scene, such as a camera's own frames, is as blurred as the events"
+        )
+    return effect

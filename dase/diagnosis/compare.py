@@ -62,7 +62,7 @@ def compare(
     tell = progress or (lambda text, share, error: None)
     tell("reading the measurement", 0.0, float("nan"))
     model = as_sensor(sensor)
-    measurement = as_measurement(measured, scene, trust)
+    measurement = as_measurement(measured, scene, trust).through_lens_of(model)
     model = model.bound_to(measurement.scene)
     premises = ModelPremises(model.log_eps, unbroken=model.unbroken)
     evidence = split_measurement(measurement, models=premises, pixels=pixels, seed=seed, device=device)

@@ -8,6 +8,7 @@ from dataclasses import replace
 from functools import partial
 from os import PathLike
 
+from dase.diagnosis.blurred_lens import with_blurred_lens
 from dase.diagnosis.compared_measurement import ComparedMeasurement, choose_compared
 from dase.diagnosis.conclusion import conclude_diagnosis, known_so_far
 from dase.diagnosis.dead_time import EFFECT as REFRACTORY
@@ -99,7 +100,7 @@ def diagnose(
     )  # fmt: skip
     given = Sensor() if sensor is None else as_sensor(sensor)
     refuse_idle(given, free)
-    measurement = as_measurement(measured, scene, trust)
+    measurement = as_measurement(measured, scene, trust).through_lens_of(given)
     given = given.bound_to(measurement.scene)
     tell("looking at the events alone", 0.0, float("nan"))
     compared = choose_compared(
@@ -132,6 +133,8 @@ def diagnose(
     seen = settle_jitter(state.task, state.events_alone, seen, measurement, model, judgement)
     found = conclude_diagnosis(state, start, model, before, seen, names, measurement)
     found = _with_what_pixels_show(found, state.task, compared, seen, model, strength)
+    if measurement.lens is not None:
+        found = with_blurred_lens(found, state.task, compared, start, model)
     return measurement.noted(replace(found, seconds=time.perf_counter() - begin))
 
 

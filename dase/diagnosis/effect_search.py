@@ -8,6 +8,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
+from dase.diagnosis.blurred_lens import EFFECT as LENS
+from dase.diagnosis.blurred_lens import seen_through_a_lens
 from dase.diagnosis.candidates import (
     Candidate,
     calibrate_split,
@@ -62,6 +64,14 @@ def search_effects(
         model = _fit_all_of_the_time(state, compared, model, judgement)
         model, judgement = _add_one_by_one(state, compared, model, _left_to_add(state.task, model, most))
     task = state.task  # the measurement is split no more
+    if most > 0 and not reaches_floor(judgement) and LENS in task.effects and LENS not in task.given:
+        task.progress("looking at the lens", 0.0, judgement.error)
+        known = task.given | state.path.certain
+        state.other_scene = seen_through_a_lens(
+            compared.measurement, model, judgement.error, known, compared.split, seed=task.seed
+        )
+        if state.other_scene is not None:
+            return model, judgement
     if not _is_enough(task, judgement) and most > 1:
         model, judgement = _go_the_other_way(state, compared, model, judgement, most)
     if not reaches_floor(judgement) and most > 1:

@@ -152,6 +152,7 @@ class Observations:
             there is one, was busy at most.
         row_load: The same of an arbiter that takes rows.
         column_load: The same of one that takes columns.
+        stamped_again: Share of the events that a scan has stamped like the one before of their pixel.
     """
 
     peak_frequency: float
@@ -171,6 +172,7 @@ class Observations:
     bus_load: float = math.inf
     row_load: float = math.inf
     column_load: float = math.inf
+    stamped_again: float = 0.0
 
     @property
     def bus_is_idle(self) -> bool:

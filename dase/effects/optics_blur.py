@@ -108,6 +108,7 @@ class OpticsBlur(SceneEffect):
         off=0.0,
         bounds=(0.0, 20.0),  # wider, the window of the blur would be slow and no lens
         plausible=(0.3, 3.0),
+        fitted=False,  # a fit moves what pixels do with light, not the light
         about="standard deviation of the point spread",
     )
 

@@ -24,6 +24,9 @@ from dase.events import Events
 
 DIRECTIONS = ("down", "up", "right", "left")
 
+ROOM_FOR_ONE = 1e-3
+"""Share of events that are not the first of their pixel at a reading, from which on all of them are sent."""
+
 
 class Scan(Reader):
     """Holds events until their line is read.
@@ -31,7 +34,8 @@ class Scan(Reader):
     Lines are numbered for ever: line n is read at n times the line time, and is row or column n % lines.
     """
 
-    def __init__(self, line: float, direction: str, width: int, height: int):
+    def __init__(self, line: float, direction: str, width: int, height: int, keeps: str = "first"):
+        self._keeps_all = keeps == "all"
         self._line = round(line * 1e12)  # [ps], so that 640 lines of 304.94 ns make a scan of 195.16 µs
         self._direction = direction
         self._lines = height if direction in ("down", "up") else width
@@ -39,7 +43,7 @@ class Scan(Reader):
         self._due = np.empty(0, np.int64)
 
     def push(self, events: Events, until: float) -> tuple[Events, float]:
-        """Give the events whose line is read before `until`, one for each pixel and scan."""
+        """Give the events whose line is read before `until`, one or all of each pixel and scan."""
         waiting = Events.concatenate([self._waiting, events])
         due = np.concatenate([self._due, self.next_line(events)])
         leaves = due * self._line // 1000 < to_nanosecond(until)
@@ -50,7 +54,7 @@ class Scan(Reader):
         line, across = due[index], across[index]
         # a pixel holds its first request until it is read, and does not look at the light meanwhile
         first = np.ones(len(index), np.bool_)
-        first[1:] = (line[1:] != line[:-1]) | (across[1:] != across[:-1])
+        first[1:] = self._keeps_all | (line[1:] != line[:-1]) | (across[1:] != across[:-1])
         return replace(waiting.select(index[first]), t=to_seconds(line[first] * self._line // 1000)), until
 
     def next_line(self, events: Events) -> NDArray[np.int64]:
@@ -70,7 +74,7 @@ class RowScan(StreamEffect):
     Some sensors do not answer a pixel when it asks, but visit their rows (or columns) in turn. An event gets
     the time at which its row is read next, so events come in lines, the intervals of a pixel are multiples of
     the scan time, and fast motion is sheared. A pixel has room for one event: of several within one scan, the
-    first is sent and the others are lost.
+    first is sent and the others are lost. Simulators that only move time stamps send all of them at once.
 
     Row n of N is read at the times (n + k N) * `line` for whole k; `direction` says where the scan goes.
     """
@@ -101,6 +105,7 @@ class RowScan(StreamEffect):
         fitted=False,  # the scans of any other line time soon are out of step with the measured ones
     )
     direction: str = choice("down", among=DIRECTIONS, about="where the scan goes; right and left: columns")
+    keeps: str = choice("first", among=("first", "all"), about="what is sent of a pixel's events of one scan")
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -110,7 +115,10 @@ class RowScan(StreamEffect):
     @classmethod
     def candidates(cls, observed: Observations) -> list[Self]:
         """Return the scan that is seen in the time stamps, if any is."""
-        return [cls(line=observed.line_time, direction=observed.scan_direction)] if observed.line_time else []
+        if not observed.line_time:
+            return []
+        keeps = "all" if observed.stamped_again > ROOM_FOR_ONE else "first"
+        return [cls(line=observed.line_time, direction=observed.scan_direction, keeps=keeps)]
 
     def longest_delay(self, lines: int) -> float:
         """Return about how late it makes events: the time of a scan [s]."""
@@ -122,4 +130,4 @@ class RowScan(StreamEffect):
 
     def reader(self, width: int, height: int, seed: int) -> Scan:
         """Return the scan of one sensor."""
-        return Scan(self.line, self.direction, width, height)
+        return Scan(self.line, self.direction, width, height, self.keeps)

@@ -1,4 +1,4 @@
-"""How busy a bus can have been, by the time stamps alone."""
+"""How busy a bus can have been, and whether a scan has room for one event, by the time stamps alone."""
 
 from __future__ import annotations
 
@@ -22,6 +22,8 @@ class BusUse:
         load: Share of the busiest time in which it sent one event after the other.
         row_load: The same of an arbiter that takes rows.
         column_load: The same of one that takes columns.
+        stamped_again: Share of the events that a scan has stamped like the one before of their pixel; 0
+            without a scan.
     """
 
     rate: float = 0.0
@@ -29,6 +31,7 @@ class BusUse:
     load: float = math.inf
     row_load: float = math.inf
     column_load: float = math.inf
+    stamped_again: float = 0.0
 
     @classmethod
     def of(cls, events: Events, structure: TimestampStructure, *, span: float) -> BusUse:
@@ -40,7 +43,8 @@ class BusUse:
             span: Time for which events are counted to see how fast they come [s].
         """
         if structure.line or len(events) < 2:
-            return cls()  # stamps tell when a line was read, not when it was sent
+            # stamps tell when a line was read, not when it was sent
+            return cls(stamped_again=share_stamped_again(events) if structure.line else 0.0)
         slack = max(PATTERNS.file_step, structure.step)
         counts = _counts_of_spans(events.t, span)
         most, least = float(counts.max()) / span, least_bus_rate(events, structure)
@@ -52,6 +56,15 @@ class BusUse:
             for lines in (events.y, events.x)
         )
         return cls(least, usual / least, most / least, rows, columns)
+
+
+def share_stamped_again(events: Events) -> float:
+    """Return the share of events with the time stamp of the one before of their pixel."""
+    if not len(events):
+        return 0.0
+    stamp = np.concatenate([[0], np.cumsum(np.diff(events.t) > 0)])
+    pixel = events.y.astype(np.int64) * events.width + events.x
+    return 1 - len(np.unique(stamp * (events.width * events.height) + pixel)) / len(events)
 
 
 def highest_event_rate(events: Events, span: float) -> float:

@@ -135,6 +135,7 @@ class SplitMeasurement:
             bus_load=self.bus.load,
             row_load=self.bus.row_load,
             column_load=self.bus.column_load,
+            stamped_again=self.bus.stamped_again,
             idle_bus=idle_bus,
             frame_interval=frames.interval if frames else 0.0,
             frame_begin=frames.begin if frames else 0.0,

@@ -100,7 +100,7 @@ def fit(
     start = as_sensor(sensor)
     model_of(start, free)  # refuses names that are not there before anything takes time
     refuse_idle(start, free)
-    measurement = as_measurement(measured, scene, trust)
+    measurement = as_measurement(measured, scene, trust).through_lens_of(start)
     scene = measurement.scene
     start = start.bound_to(scene)
     follows = follows_frames(start)

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dase import io
+from dase.effects.optics_blur import OpticsBlur, blur_weights
 from dase.errors import InputError
 from dase.events import Events
 from dase.fitting.held_clips import holds_frames
@@ -34,6 +35,7 @@ from dase.scenes.scene import Scene
 from dase.scenes.screen_scene import ScreenScene
 from dase.scenes.screen_stimulus import read_stimulus
 from dase.scenes.video import VideoScene, are_dense, join_frames, open_video
+from dase.simulation.sensor import Sensor
 
 Found = TypeVar("Found", Comparison, Diagnosis, Fit)
 
@@ -48,6 +50,7 @@ class Measurement:
         trust: Where and when the scene is to be trusted; None for everywhere.
         notes: What was noticed while reading.
         span: First and last time that is compared [s]; None for all.
+        lens: Through which the scene is seen, where the events have told it; None without one.
     """
 
     events: Events
@@ -55,6 +58,7 @@ class Measurement:
     trust: Trust | None = None
     notes: tuple[str, ...] = ()
     span: tuple[float, float] | None = None
+    lens: OpticsBlur | None = None
 
     @property
     def held(self) -> float:
@@ -92,6 +96,26 @@ class Measurement:
             mask = mask_of_region(region, self.events.width, self.events.height)
             out = replace(out, trust=_trust_within(mask, out.trust))
         return out
+
+    def through_lens_of(self, sensor: Sensor) -> Measurement:
+        """Return the measurement with its scene as the lens of a sensor shows it.
+
+        Frames that the camera took itself, and what was found of a screen in its events, are left as they
+        are: that lens has shown them already.
+
+        Args:
+            sensor: Its `optics_blur` is the lens; without one, or with one that is off, nothing changes.
+        """
+        lens = next((one for one in sensor.effects if isinstance(one, OpticsBlur)), None)
+        scene = self.scene
+        if lens is None or lens.is_off() or isinstance(scene, CameraScene | ScreenScene):
+            return self
+        if isinstance(scene, VideoScene):
+            # its frames are compared, and held; seen through a lens already in a second way of a diagnosis
+            seen: Scene = scene if scene.sharp is not None else scene.blurred(blur_weights(lens.sigma))
+        else:
+            seen = lens.seen(scene)
+        return replace(self, scene=seen)
 
     def compared_events(self) -> Events:
         """Return the events of the time that is compared."""

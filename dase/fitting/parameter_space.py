@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dase.effects.base import Effect, Parameter
+from dase.effects.optics import SceneEffect
 from dase.effects.threshold import Threshold
 from dase.errors import InputError, nearest
 from dase.simulation.sensor import Sensor
@@ -180,13 +181,14 @@ def axes_of(sensor: Sensor, names: Iterable[str] | None = None) -> tuple[SearchA
             nothing by its words.
 
     Raises:
-        InputError: A name that the sensor does not have.
+        InputError: A name that the sensor does not have, or of what acts on pictures.
     """
     every = {
         f"{effect.name}.{p.name}": axis_of(effect, p)
         for effect in sensor.effects
         for p in effect.parameters()
     }
+    on_pictures = {effect.name for effect in sensor.effects if isinstance(effect, SceneEffect)}
     idle = sensor.idle_parameters()
     usual = {name for name, axis in every.items() if axis.fact.fitted and name not in idle}
     if names is None:
@@ -196,6 +198,8 @@ def axes_of(sensor: Sensor, names: Iterable[str] | None = None) -> tuple[SearchA
     chosen = []
     for name in names:
         found = [n for n in every if n == name or (n.split(".")[0] == name and n in usual)]
+        if name.split(".")[0] in on_pictures:
+            raise InputError(f"free: {name} acts on pictures, which a fit leaves as they are")
         if not found:
             known = [*every, *(e.name for e in sensor.effects)]
             raise InputError(f"free: the sensor has no parameter '{name}': {nearest(name, known)}")

@@ -15,10 +15,11 @@ def grey_step_of(scene: Scene) -> float:
     """Return the least step between greys of a clip [intensity], as in the dark; 0 where they are not few.
 
     Args:
-        scene: Any; only clips have such steps.
+        scene: Any; only clips have such steps, those behind a lens as they are before it.
     """
     if not isinstance(scene, VideoScene):
         return 0.0
+    scene = scene.sharp or scene
     times = scene.sample_times()
     values = np.unique(scene.frames(times[sorted({0, len(times) // 2, len(times) - 1})]))
     return float(np.diff(values).min()) if 1 < len(values) <= MOST_GREYS else 0.0

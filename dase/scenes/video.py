@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from copy import copy
 from os import PathLike
 from pathlib import Path
@@ -17,6 +18,7 @@ from dase.io import frames as picture_frames
 from dase.io.image_files import cut_and_resize, grey_and_colour, list_pictures
 from dase.io.video_file import FrameReader
 from dase.kernels import pixel_stages
+from dase.kernels.scene_blur import blur_pictures
 from dase.kernels.scene_layers import interpolate_frames
 from dase.kernels.stored_levels import LEVELS, light_of_levels, upload_levels
 from dase.scenes.between_frames import CameraScene
@@ -93,6 +95,10 @@ class RepeatedFrames:
     def __len__(self) -> int:
         return len(self._index)
 
+    def of(self, changed: Callable[[Frames], Frames]) -> RepeatedFrames:
+        """Return the same frames, each changed once however often it is there."""
+        return RepeatedFrames(changed(self._frames), self._index)
+
     def __getitem__(self, index: NDArray[np.int64]) -> NDArray[Any]:
         """Return the frames of increasing indices (K,), shape (K, height, width)."""
         needed, place = np.unique(self._index[index], return_inverse=True)
@@ -100,10 +106,34 @@ class RepeatedFrames:
         return out
 
 
+class BlurredFrames:
+    """Frames behind a lens, worked out when they are asked for: linear intensity.
+
+    Args:
+        frames: Without the lens.
+        gamma: Linear intensity is value ** gamma.
+        weights: Of the middle, the first neighbours, the second neighbours and so on, shape (R + 1,).
+    """
+
+    ndim = 3
+
+    def __init__(self, frames: Frames, gamma: float, weights: NDArray[np.float32]):
+        self._frames, self._gamma, self._weights = frames, gamma, weights
+        self.shape: tuple[int, ...] = tuple(frames.shape)
+
+    def __len__(self) -> int:
+        return self.shape[0]
+
+    def __getitem__(self, index: NDArray[np.int64]) -> NDArray[np.float32]:
+        """Return the frames of increasing indices (K,), shape (K, height, width)."""
+        light = to_light(self._frames[index], gamma=self._gamma)
+        return blur_pictures(np.ascontiguousarray(light, np.float32), self._weights)
+
+
 EARLY = 5e-6
 """Begin of a held frame's light before its time [s]: what comes at once is stamped with that time."""
 
-Frames = NDArray[Any] | FrameReader | FilteredFrames | RepeatedFrames
+Frames = NDArray[Any] | FrameReader | FilteredFrames | RepeatedFrames | BlurredFrames
 """What a `VideoScene` takes frames from, shape (F, height, width)."""
 
 
@@ -128,9 +158,12 @@ class VideoScene(Scene):
     by_frames = False
     """Whether a simulator has filtered light from frame to frame, and knows none between them."""
 
+    sharp: VideoScene | None = None
+    """The clip as it is, where this is what a lens makes of it."""
+
     def __init__(
         self,
-        frames: ArrayLike | FrameReader | FilteredFrames | RepeatedFrames,
+        frames: ArrayLike | FrameReader | FilteredFrames | RepeatedFrames | BlurredFrames,
         times: ArrayLike,
         *,
         gamma: float = 1.0,
@@ -138,7 +171,7 @@ class VideoScene(Scene):
         self.gamma = check_gamma(gamma)
         self._frames: Frames = (
             frames
-            if isinstance(frames, FrameReader | FilteredFrames | RepeatedFrames)
+            if isinstance(frames, FrameReader | FilteredFrames | RepeatedFrames | BlurredFrames)
             else np.asarray(frames)
         )
         self._colours: ColourFrames | FrameReader | None = None
@@ -197,6 +230,21 @@ class VideoScene(Scene):
         times = np.concatenate((self._times[:1], inner.ravel())) - EARLY
         out = VideoScene(RepeatedFrames(self._frames, index), times, gamma=self.gamma)
         out.held_for = self.longest_gap()
+        return out
+
+    def blurred(self, weights: NDArray[np.float32]) -> VideoScene:
+        """Return the clip as a lens shows it: each frame blurred along its rows and its columns.
+
+        Args:
+            weights: Of the middle, the first neighbours, the second neighbours and so on, shape (R + 1,).
+        """
+        frames: BlurredFrames | RepeatedFrames
+        if isinstance(self._frames, RepeatedFrames):
+            frames = self._frames.of(lambda once: BlurredFrames(once, self.gamma, weights))
+        else:
+            frames = BlurredFrames(self._frames, self.gamma, weights)
+        out = VideoScene(frames, self._times)
+        out.held_for, out.by_frames, out.sharp = self.held_for, self.by_frames, self
         return out
 
     def source(self, times: NDArray[np.float64], pixels: NDArray[np.int32], device: Any) -> tuple[str, Any]:

@@ -102,7 +102,9 @@ def test_late_events_wait_in_the_pixels(device, rng):
 # ---- row scan
 
 
-def scanned(events: dase.Events, line_ps: int, direction: str) -> list[tuple[int, int, int, int]]:
+def scanned(
+    events: dase.Events, line_ps: int, direction: str, *, keeps: str = "first"
+) -> list[tuple[int, int, int, int]]:
     """Return (t [ns], x, y, p) as a scan reads them, found by walking from line to line."""
     lines = {"down": HEIGHT, "up": HEIGHT, "right": WIDTH, "left": WIDTH}[direction]
     requests: dict[tuple[int, int], deque] = {}
@@ -119,7 +121,8 @@ def scanned(events: dase.Events, line_ps: int, direction: str) -> list[tuple[int
             place = lines - 1 - place
         axis = 1 if direction in ("down", "up") else 0
         for x, y in sorted(pixel for pixel in requests if pixel[axis] == place):
-            out.append((now // 1000, x, y, requests.pop((x, y))[0]))
+            held = list(requests.pop((x, y)))
+            out += [(now // 1000, x, y, p) for p in (held if keeps == "all" else held[:1])]
         line += 1
     return out
 
@@ -131,6 +134,9 @@ def test_row_scan_reads_line_after_line(rng, direction, line_ps, tick):
     got = through(camera(RowScan(line=line_ps * 1e-12, direction=direction)), events)
     assert rows_of(got) == scanned(events, line_ps, direction)
     assert len(got) < 0.95 * len(events)
+    every = through(camera(RowScan(line=line_ps * 1e-12, direction=direction, keeps="all")), events)
+    assert rows_of(every) == scanned(events, line_ps, direction, keeps="all")
+    assert len(every) == len(events)
 
 
 def test_row_scan_of_a_simulation(device, rng):

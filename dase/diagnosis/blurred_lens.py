@@ -1,0 +1,222 @@
+"""Whether the camera saw a clip less sharply than it is: a lens, which no fit of what pixels do can find.
+
+A lens acts on pictures, so each width of it is another scene. It is asked for where a search ends with
+something unexplained: one number is tried against all that was added. Where it leaves less, the search begins
+anew behind that lens. A camera's own frames are as blurred as its events, and are not asked.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+
+from dase.diagnosis.compared_measurement import ComparedMeasurement
+from dase.diagnosis.grading import grade_of, judge_on_report
+from dase.diagnosis.state import DiagnosisTask
+from dase.effects.optics_blur import OpticsBlur
+from dase.fitting.data_split import SplitMeasurement
+from dase.fitting.measurement import Measurement
+from dase.fitting.model import FittedModel, fit_present_model, model_of, refit_model
+from dase.probes.random_streams import SimulationStream
+from dase.results import Diagnosis, Estimate, Finding, Grade
+from dase.scenes.scene import Scene
+from dase.scenes.video import VideoScene
+from dase.simulation.sensor import Sensor
+
+EFFECT = OpticsBlur.name
+
+
+@dataclass(frozen=True)
+class LensSettings:
+    """Which lenses are tried, and how much one must explain."""
+
+    widths: tuple[float, ...] = (0.6, 1.2, 2.4)
+    """Standard deviations of the point spread that are tried first [px]."""
+
+    finer: tuple[float, ...] = (0.5, 0.25)
+    """Then those so many octaves on both sides of the best one."""
+
+    closest: float = 0.125
+    """And of the last model those so many octaves away: between them lies the width [octaves]."""
+
+    better: float = 0.8
+    """Share of the error of the last model that a lens leaves at most, without all that was added to it and
+    is not certain."""
+
+    worth: float = 2.0
+    """What is left after a coarser look, in units of what may be left, with which finer ones go on."""
+
+    repeats: int = 12
+    """Simulations that judge."""
+
+
+LENS = LensSettings()
+
+
+def seen_through_a_lens(
+    measurement: Measurement,
+    model: FittedModel,
+    error: float,
+    known: Iterable[str],
+    split: Callable[[Scene], SplitMeasurement],
+    *,
+    seed: int,
+    settings: LensSettings = LENS,
+) -> Measurement | None:
+    """Return a measurement whose clip is seen through a lens; None where that explains no more.
+
+    Args:
+        measurement: Of a clip, without a lens.
+        model: The last one.
+        error: Its error, of the part that chooses.
+        known: Names of its effects that are not in question.
+        split: Splits the measurement with another scene.
+        seed: Of every random number.
+        settings: What is tried.
+    """
+    scene = measurement.scene
+    if not isinstance(scene, VideoScene) or scene.sharp is not None:
+        return None
+    bare = model.sensor
+    for effect in model.sensor.effects:
+        bare = bare if effect.name in known else bare.without(effect.name)
+    free = [axis.name for axis in model.space.axes if axis.effect.name in bare]
+
+    def left(width: float) -> float:
+        evidence = split(behind_lens(measurement, width).scene)
+        fitted = fit_present_model(evidence, bare, free, seed=seed)
+        return error_of_choice(evidence, fitted, seed=seed)
+
+    width = best_width(left, settings.better * error, settings)
+    return None if width is None else behind_lens(measurement, width)
+
+
+def best_width(
+    left: Callable[[float], float], most: float = math.inf, settings: LensSettings = LENS
+) -> float | None:
+    """Return the width of a point spread [px] that leaves the least error; None where that is too much.
+
+    Args:
+        left: Tells the error behind a lens of a width [px].
+        most: Error that is not too much.
+        settings: What is tried.
+    """
+    errors = {width: left(width) for width in settings.widths}
+    for octaves in settings.finer:
+        if min(errors.values()) > settings.worth * most:
+            return None
+        best = min(errors, key=lambda width: errors[width])
+        errors |= {width: left(width) for width in _beside(best, octaves)}
+    best, step = min(errors, key=lambda width: errors[width]), settings.finer[-1]
+    if errors[best] > most:
+        return None
+    low, high = (errors[width] if width in errors else left(width) for width in _beside(best, step))
+    return _least_between(best, step, (low, errors[best], high))
+
+
+def with_blurred_lens(
+    diagnosis: Diagnosis,
+    task: DiagnosisTask,
+    compared: ComparedMeasurement,
+    start: FittedModel,
+    model: FittedModel,
+    settings: LensSettings = LENS,
+) -> Diagnosis:
+    """Return a diagnosis that says that the clip is seen through a lens, and how wide its point spread is.
+
+    Args:
+        diagnosis: Made behind that lens.
+        task: What the diagnosis is asked.
+        compared: The measurement, which has the lens.
+        start: The model before the search.
+        model: The last one.
+        settings: How finely the width is told.
+    """
+    measurement, seed = compared.measurement, task.seed
+    scene, lens = measurement.scene, measurement.lens
+    assert isinstance(scene, VideoScene)
+    assert scene.sharp is not None
+    assert lens is not None
+    task.progress("how sharp the lens is", 0.9, diagnosis.errors[-1])
+    sharp = compared.split(scene.sharp, all_time=task.all_time)
+    stream, repeats = SimulationStream.JUDGE.seed(seed), task.settings.repeats
+    given = model_of(compared.given).judge(sharp.report, repeats=repeats // 2, seed=stream)
+    first, without = (
+        refit_model(sharp, one, seed=seed).judge(sharp.report, repeats=repeats, seed=stream)
+        for one in (start, model)
+    )
+    last = judge_on_report(task, [model], repeats=repeats)[0].judgement
+    grade, unknown = grade_of(first, without, last, math.inf, has_rivals=False, settings=task.settings.grades)
+    width = _width_beside(compared, task, model, lens.sigma, settings)
+    mine = {f"{EFFECT}.sigma": width}
+    found = Finding(
+        EFFECT, grade, unknown=unknown, error_without=without.error, error_with=last.error, parameters=mine
+    )
+    if grade is Grade.STAND_IN:
+        return replace(diagnosis, before=given.error, stand_ins=(*diagnosis.stand_ins, found))
+    out = replace(diagnosis, before=given.error, findings=(*diagnosis.findings, found))
+    if grade is Grade.EITHER:
+        return out
+    return replace(
+        out,
+        sensor=out.sensor.with_effect(OpticsBlur(sigma=width.value)),
+        selected=(EFFECT, *out.selected),
+        errors=(first.error, *out.errors),
+        parameters={**mine, **out.parameters},
+    )
+
+
+def behind_lens(measurement: Measurement, width: float) -> Measurement:
+    """Return a measurement whose clip is seen through a lens of this width [px]."""
+    lens = OpticsBlur(sigma=width)
+    scene = measurement.scene
+    bare = replace(measurement, scene=(scene.sharp or scene) if isinstance(scene, VideoScene) else scene)
+    return replace(bare.through_lens_of(Sensor().with_effect(lens)), lens=lens)
+
+
+def _beside(width: float, octaves: float) -> tuple[float, float]:
+    """Return the widths so many octaves below and above one."""
+    return width * math.exp2(-octaves), width * math.exp2(octaves)
+
+
+def error_of_choice(
+    evidence: SplitMeasurement, model: FittedModel, *, seed: int, settings: LensSettings = LENS
+) -> float:
+    """Return the error of a model, of the part that chooses."""
+    stream = SimulationStream.JUDGE.seed(seed)
+    return model.judge(evidence.held, repeats=settings.repeats, seed=stream).error
+
+
+def _width_beside(
+    compared: ComparedMeasurement,
+    task: DiagnosisTask,
+    model: FittedModel,
+    width: float,
+    settings: LensSettings,
+) -> Estimate:
+    """Return the width of the point spread [px] beside the last model, between two that leave more."""
+    errors, step = list[float](), settings.closest
+    for octaves in (-step, 0.0, step):
+        seen = behind_lens(compared.measurement, width * math.exp2(octaves))
+        evidence = compared.split(seen.scene, all_time=task.all_time)
+        fitted = refit_model(evidence, model, seed=task.seed, rounds=1)
+        errors.append(error_of_choice(evidence, fitted, seed=task.seed, settings=settings))
+    low, middle, high = errors
+    best = _least_between(width, step, (low, middle, high))
+    return Estimate(best, *_beside(best, step))
+
+
+def _least_between(width: float, step: float, errors: tuple[float, float, float]) -> float:
+    """Return the width that leaves least, by a parabola through three errors.
+
+    Args:
+        width: The one in the middle [px].
+        step: To the others, below and above it [octaves].
+        errors: Of the three, in this order.
+    """
+    low, middle, high = errors
+    curve = low - 2 * middle + high
+    # where the parabola opens downwards, the better end
+    off = 0.5 * (low - high) / curve if curve > 0 else math.copysign(1.0, low - high)
+    return width * math.exp2(step * min(max(off, -1.0), 1.0))

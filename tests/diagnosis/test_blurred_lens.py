@@ -1,0 +1,99 @@
+"""Clips that are sharper than the camera saw them: its lens is found, and what pixels do beside it."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+from helpers.brief_diagnosis import NO_LIMITS
+from helpers.frame_simulator import shaken_texture
+
+import dase
+from dase.effects import EFFECTS
+from dase.effects.bandwidth import Bandwidth
+from dase.effects.optics_blur import OpticsBlur
+from dase.events import Events
+from dase.fitting.measurement import Measurement
+from dase.scenes.video import VideoScene
+
+SIGMA = 1.3
+TRIED = {name: EFFECTS[name] for name in ("optics_blur", "bandwidth", "jitter", "leak", "shot", "mismatch")}
+PIXELS = 200
+
+
+@pytest.fixture(scope="module")
+def scene() -> VideoScene:
+    """Texture from step to step of a pixel, so that there is something to blur."""
+    smooth = shaken_texture()
+    times = smooth.sample_times()
+    light = smooth.frames(times)
+    edges = np.clip(0.5 + 3 * (light - cv2.GaussianBlur(light.mean(0), (0, 0), 9)), 0.1, 1)
+    return VideoScene((255 * edges).astype(np.uint8), times)
+
+
+def behind_lens(scene: VideoScene, sigma: float, *more: dase.Effect) -> Events:
+    """Return events of a clip that OpenCV has blurred, so that dase's lens takes no part."""
+    times = scene.sample_times()
+    light = [cv2.GaussianBlur(frame, (0, 0), sigma) for frame in scene.frames(times)]
+    sensor = dase.Sensor((*more, dase.EFFECTS["threshold"](on=0.2, off=0.22)))
+    return dase.simulate(VideoScene(np.stack(light), times), sensor, seed=1)
+
+
+@pytest.mark.slow
+def test_a_lens_is_found_beside_a_leak(scene):
+    events = behind_lens(scene, SIGMA, dase.EFFECTS["leak"](rate=4.0))
+    found = dase.diagnose(
+        events, "ideal", scene=scene, effects=TRIED, most=2, pixels=PIXELS, settings=NO_LIMITS
+    )
+    assert found.selected == ("optics_blur", "leak")
+    width = found.parameters["optics_blur.sigma"]
+    assert width.value == pytest.approx(SIGMA, rel=0.06)
+    assert width.low < SIGMA < width.high
+    assert found.sensor["optics_blur"].sigma == width.value
+    assert found.sensor["leak"].rate == pytest.approx(4.0, rel=0.15)
+    # each step has an error, the first one without the lens, and as given it is larger still
+    sharp, *others = found.errors
+    assert len(others) == 2
+    assert sharp > 3 * others[0] > 3 * others[1]
+    assert found.unexplained is None
+    # what it wrote is what the clip is compared with
+    assert dase.compare(events, found.sensor, scene=scene, pixels=PIXELS).error < 1
+
+
+@pytest.mark.slow
+def test_a_slow_photoreceptor_that_nobody_knows_is_no_lens(scene):
+    sensor = dase.Sensor((Bandwidth(cutoff=25.0), dase.EFFECTS["threshold"](on=0.2, off=0.22)))
+    events = dase.simulate(scene, sensor, seed=1)
+    known = {name: effect for name, effect in TRIED.items() if name != "bandwidth"}
+    found = dase.diagnose(
+        events, "ideal", scene=scene, effects=known, most=2, pixels=PIXELS, settings=NO_LIMITS
+    )
+    assert "optics_blur" not in {one.effect for one in found.findings}
+
+
+def test_a_model_is_compared_and_fitted_behind_its_lens(scene):
+    events = behind_lens(scene, SIGMA)
+    sharp = dase.Sensor((dase.EFFECTS["threshold"](on=0.2, off=0.22),))
+    lens = sharp.with_effect(OpticsBlur(sigma=SIGMA))
+    without, behind = (dase.compare(events, one, scene=scene, pixels=PIXELS).error for one in (sharp, lens))
+    assert behind < 0.5
+    assert without > 3
+    fitted = dase.fit(events, lens, scene=scene, pixels=PIXELS)
+    assert fitted.sensor["optics_blur"].sigma == SIGMA
+    assert fitted.sensor["threshold"].on == pytest.approx(0.2, rel=0.02)
+    assert set(fitted.parameters) == {"threshold.on", "threshold.off"}
+
+
+def test_frames_that_are_held_are_each_blurred_once(scene):
+    behind = OpticsBlur(sigma=SIGMA)
+    held = scene.held(1e-3)
+    events = behind_lens(scene, SIGMA)
+    seen = Measurement(events, held).through_lens_of(dase.Sensor((behind, dase.EFFECTS["threshold"]())))
+    assert isinstance(seen.scene, VideoScene)
+    assert seen.held == held.held_for > 0
+    assert seen.scene.sharp is held
+    times = held.sample_times()[[0, 7, 8]]
+    want = behind.seen(held).frames(times)
+    np.testing.assert_allclose(seen.scene.frames(times), want, atol=1e-5)
+    # seen through it once more it stays as it is
+    assert seen.through_lens_of(dase.Sensor((behind, dase.EFFECTS["threshold"]()))).scene is seen.scene
