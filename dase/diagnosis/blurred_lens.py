@@ -41,8 +41,10 @@ class LensSettings:
     """And of the last model those so many octaves away: between them lies the width [octaves]."""
 
     better: float = 0.8
-    """Share of the error of the last model that a lens leaves at most, without all that was added to it and
-    is not certain."""
+    """Share of the error of the last model that a lens leaves at most where all of that is known."""
+
+    simpler: float = 1.0
+    """The same where effects were added to it that are not certain: the lens does without them."""
 
     worth: float = 2.0
     """What is left after a coarser look, in units of what may be left, with which finer ones go on."""
@@ -88,7 +90,8 @@ def seen_through_a_lens(
         fitted = fit_present_model(evidence, bare, free, seed=seed)
         return error_of_choice(evidence, fitted, seed=seed)
 
-    width = best_width(left, settings.better * error, settings)
+    share = settings.better if bare == model.sensor else settings.simpler
+    width = best_width(left, share * error, settings)
     return None if width is None else behind_lens(measurement, width)
 
 
@@ -153,9 +156,11 @@ def with_blurred_lens(
     found = Finding(
         EFFECT, grade, unknown=unknown, error_without=without.error, error_with=last.error, parameters=mine
     )
+    sharp_sensor = diagnosis.sensor.without(EFFECT)
+    out = replace(diagnosis, before=given.error, sensor=sharp_sensor)
     if grade is Grade.STAND_IN:
-        return replace(diagnosis, before=given.error, stand_ins=(*diagnosis.stand_ins, found))
-    out = replace(diagnosis, before=given.error, findings=(*diagnosis.findings, found))
+        return replace(out, stand_ins=(*out.stand_ins, found))
+    out = replace(out, findings=(*out.findings, found))
     if grade is Grade.EITHER:
         return out
     return replace(

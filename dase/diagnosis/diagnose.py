@@ -102,6 +102,8 @@ def diagnose(
     refuse_idle(given, free)
     measurement = as_measurement(measured, scene, trust).through_lens_of(given)
     given = given.bound_to(measurement.scene)
+    if measurement.lens is not None:
+        given = given.with_effect(measurement.lens)
     tell("looking at the events alone", 0.0, float("nan"))
     compared = choose_compared(
         measurement, given, effects, pixels=pixels, seed=seed, device=device, settings=settings

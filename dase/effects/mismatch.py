@@ -63,8 +63,9 @@ class Mismatch(Effect):
         bounds=(0.0, 1.0),
         plausible=(0.02, 0.5),
         about="standard deviation over pixels, relative to the threshold",
-        # a world that sets its memory at steps of time, beyond the threshold by chance, has such pixels
-        clear_beside=(("refractory", 0.05),),
+        # a world that sets its memory at steps of time, beyond the threshold by chance, has such pixels; so
+        # has a lens whose point spread is not quite that of the model
+        clear_beside=(("refractory", 0.05), ("optics_blur", 0.06)),
     )
     relative_to: str = choice(
         "own",

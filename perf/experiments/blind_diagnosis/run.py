@@ -52,6 +52,7 @@ HIDDEN: dict[str, tuple[dict[str, Any], ...]] = {
     "row_scan": tuple(dict(line=x) for x in (3e-6, 1e-5, 3e-5)),
     "readout": tuple(dict(rate=r) for r in (1.5, 0.8, 0.5)),
     "timestamp": tuple(dict(step=s, jitter=0.0) for s in (1e-4, 3e-4, 1e-3)),
+    "optics_blur": tuple(dict(sigma=s) for s in (0.5, 1.0, 2.0)),
 }
 """Effect to its parameters at weak, medium and strong; the rate of `readout` is in 600,000 events/s."""
 
@@ -66,6 +67,9 @@ CLASHES = ({"bandwidth", "second_order"}, {"shot", "voltage_noise"}, {"timestamp
 
 SHOWN = {"flicker", "hot", "readout", "timestamp", "row_scan"}
 """Effects that the events show by themselves, however well the scene is known."""
+
+IN_FRAMES = {"optics_blur"}
+"""Effects that a camera's own frames have as well, so that nothing tells them there."""
 
 HABITS = {"linlog", "timestamp"}
 """What v2e does in all of its cases, and what may be named there."""
@@ -284,7 +288,9 @@ def cases(options: argparse.Namespace) -> Iterator[Case]:
                 add("unknown", (name,), strength, removed=name)
             strength = STRENGTHS[int(rng.integers(1, 3))]
             add("noisy", (name,), strength, noisy=True)
-            add("frames", (name,), strength, frames=str(rng.choice(["25", "100"])))
+            rate = str(rng.choice(["25", "100"]))
+            if name not in IN_FRAMES:
+                add("frames", (name,), strength, frames=rate)
             add("pair", _together(rng, names, 2), "medium")
             add("triple", _together(rng, names, 3), "medium")
             add("nothing", (), "none")

@@ -30,8 +30,8 @@ from perf.experiments.blind_diagnosis.scenes import draw_scene
 
 Line = dict[str, Any]
 
-UNFITTED = ("row_scan", "timestamp")
-"""Effects of which nothing is fitted: the time stamps tell all of it."""
+UNFITTED = ("row_scan", "timestamp", "optics_blur")
+"""Effects of which nothing is fitted: the time stamps tell all of it, or it acts on pictures."""
 
 OFF = 0.15
 """Farthest that a fit begins from the truth, in the units of `SearchAxis.to_place`."""

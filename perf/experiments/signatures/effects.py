@@ -25,7 +25,6 @@ from perf.experiments.blind_diagnosis.run import HIDDEN
 from perf.experiments.signatures import run as experiment
 
 MORE: dict[str, tuple[dict[str, Any], ...]] = {
-    "optics_blur": tuple(dict(sigma=s) for s in (0.5, 1.0, 2.0)),
     "high_pass": tuple(dict(cutoff=f) for f in (0.5, 3.0, 20.0)),
     "exposure": tuple(dict(amplitude=a) for a in (0.1, 0.2, 0.5)),
     "double_events": tuple(dict(share=s, on=0.0) for s in (0.003, 0.01, 0.05)),
