@@ -60,6 +60,7 @@ def count_short_intervals(
     time: wp.array[wp.float64],  # (N,) [s], not decreasing
     pixel: wp.array[int],  # (N,) row-major
     polarity: wp.array[wp.uint8],  # (N,) 1 for ON
+    shared: wp.array[wp.uint8],  # (N,) 1 where many pixels send at that time
     tie: wp.float64,  # [s]
     near: wp.float64,  # [s]
     far: wp.float64,  # [s]
@@ -71,7 +72,8 @@ def count_short_intervals(
 ):
     """Count how often a pixel is soon seen again with the same polarity. Called with dim=1.
 
-    OFF and ON. Calm is what follows an event before which the pixel was silent for `far`.
+    OFF and ON. Calm is what follows, at a time of its own, an event before which the pixel was silent
+    for `far`.
     """
     for i in range(time.shape[0]):
         place = pixel[i]
@@ -84,7 +86,7 @@ def count_short_intervals(
             elif interval < near:
                 kind = int(1)
             count_out[kind, int(sign), place] += 1
-            if kind > 0 and last_interval[place] >= far:
+            if kind > 0 and last_interval[place] >= far and shared[i] == wp.uint8(0):
                 count_out[kind + 2, int(sign), place] += 1
         last_interval[place] = interval
         last[place] = time[i]

@@ -5,6 +5,10 @@ many per microsecond a little later. Where a delay falls as the light rises, eve
 them: ON events, and OFF events that follow such ON events. So doubles are there if OFF events have them whose
 pixel was silent before, as in all cameras that were seen to have any. Events of one pixel at one time have
 waited for each other, or share a slow clock's tick, and are no doubles.
+
+A simulator that works frame by frame sends the events of a pixel in a frame some hundred microseconds
+apart, which hides doubles among them. But all its pixels send at the same few times, and a double has one of
+its own.
 """
 
 from __future__ import annotations
@@ -38,6 +42,9 @@ class DoubleSettings:
         6.0  # times as many per second below `near` as from there to `far`; recordings have 40 and more
     )
     bulk: float = 0.98  # share of the pixels that must have them without the busiest
+    shared: float = 0.01
+    """Share of the events up to `far` before and after from which on one time is of many pixels: eight times
+    what whole microseconds have by chance."""
 
 
 class IntervalCounts:
@@ -52,26 +59,49 @@ class IntervalCounts:
     def __init__(self, width: int, height: int, settings: DoubleSettings | None = None):
         self.settings = settings or DoubleSettings()
         self.counts = np.zeros((5, 2, width * height), np.int32)
-        """Intervals below `tie`, `near` and `far`, and below `near` and `far` after as long a silence.
+        """Intervals below `tie`, `near` and `far`, and below `near` and `far` after as long a silence and not
+        at a time that many pixels share.
 
         Of OFF and of ON events, shape (5, 2, H * W).
         """
         self.events = np.zeros((2, width * height), np.int64)
         """OFF and ON events."""
+        self._around = Events.empty(width, height)
+        self._counted = 0
         self._last = np.full(width * height, -np.inf)
         self._interval = np.full(width * height, np.inf)
         self._polarity = np.zeros(width * height, np.uint8)
         self._cpu = launch.find_device("cpu")
 
     def push(self, events: Events) -> None:
-        """Take events."""
-        if not len(events):
-            return
+        """Take events; the last are held back, for what comes after them tells whether they share a time."""
+        if len(events):
+            self._count(Events.concatenate([self._around, events]), float(events.t[-1]) - self._reach)
+
+    def finish(self) -> None:
+        """Take the events that were held back."""
+        self._count(self._around, np.inf)
+
+    @property
+    def _reach(self) -> float:
+        return self.settings.far + self.settings.tie
+
+    def _count(self, events: Events, until: float) -> None:
+        """Count events of which those before `_counted` are, up to a time [s], and keep what is around it."""
+        end = int(np.searchsorted(events.t, until))
+        if end > self._counted:
+            shared = times_of_many(events.t, slice(self._counted, end), self.settings)
+            self._count_intervals(events.select(slice(self._counted, end)), shared)
+        begin = int(np.searchsorted(events.t, until - self._reach))
+        self._around, self._counted = events.select(slice(begin, None)), end - begin
+
+    def _count_intervals(self, events: Events, shared: NDArray[np.bool_]) -> None:
         pixel = row_major_pixels(events)
         for polarity, row in enumerate(self.events):
             row += np.bincount(pixel[events.p == polarity], minlength=len(row))
         columns = (
             (events.t, wp.float64), (pixel, int), (events.p.astype(np.uint8), wp.uint8),
+            (shared.astype(np.uint8), wp.uint8),
             (self._last, wp.float64), (self._interval, wp.float64), (self._polarity, wp.uint8),
             (self.counts, int),
         )  # fmt: skip
@@ -79,8 +109,28 @@ class IntervalCounts:
         # whole microseconds as floating point numbers: 20 of them are not less than 20
         s = self.settings
         limits = [wp.float64(value - 1e-9) for value in (s.tie, s.near, s.far)]
-        inputs = [*arrays[:3], *limits, *arrays[3:]]
+        inputs = [*arrays[:4], *limits, *arrays[4:]]
         wp.launch(count_short_intervals, dim=1, inputs=inputs, device=self._cpu)
+
+
+def times_of_many(
+    t: NDArray[np.float64], asked: slice, settings: DoubleSettings | None = None
+) -> NDArray[np.bool_]:
+    """Return at which times so many events come as if all pixels shared a few of them, shape (K,).
+
+    Args:
+        t: Times of events [s], sorted, shape (N,).
+        asked: K of them.
+        settings: What is a double event.
+    """
+    s = settings or DoubleSettings()
+
+    def others(reach: float) -> NDArray[np.int64]:
+        out: NDArray[np.int64] = np.searchsorted(t, t[asked] + reach, side="right")
+        return out - np.searchsorted(t, t[asked] - reach) - 1
+
+    out: NDArray[np.bool_] = others(s.tie) > s.shared * others(s.far)
+    return out
 
 
 def find_double_events(
@@ -89,8 +139,9 @@ def find_double_events(
     """Look for pixels that send twice.
 
     The null has as many intervals per second below 20 µs as from there to 400 µs: binomial. It must fail for
-    pairs of OFF events before which the pixel was silent for 400 µs, and without the busiest pixels, too:
-    where thresholds differ, a few send dozens at a jump.
+    pairs of OFF events before which the pixel was silent for 400 µs and whose second does not share its time
+    with many pixels, and without the busiest pixels, too: where thresholds differ, a few send dozens at a
+    jump.
 
     Args:
         intervals: Counted intervals.
@@ -112,22 +163,16 @@ def find_double_events(
             DOUBLE_EVENTS, f"{format_count(events)} events, too few for a share of {format_percent(s.least)}"
         )
     chance = s.near / s.far
-    p = 0.0
-    soon_off, later_off = (row[0] for row in intervals.counts[3:])
-    for some in (~hot, ~hot & (count <= busy)):
-        soon, later = int(soon_off[some].sum()), int(later_off[some].sum())
-        p = max(p, float(stats.binom.sf(soon - 1, soon + later, chance)) if soon else 1.0)
-        if soon * (1 / chance - 1) < s.ratio * later:
-            p = 1.0  # fast, but no faster than fast
-        if soon < s.least * intervals.events[0, some].sum():
-            p = 1.0  # others have caught up with each other
+    p = max(_chance_of(intervals, some) for some in (~hot, ~hot & (count <= busy)))
     low, high = (limit / events for limit in poisson_interval(near))
     share = near / events
+    hidden = ", most of these where many pixels send at one time"
+    at_once = hidden if p < 1 and near * (1 / chance - 1) < s.ratio * rest else ""
     entry = Signature(
         name=DOUBLE_EVENTS, answer=Answer.NOT_SEEN, p=p, size=share, low=low, high=high,
         unit="share of the events", least=s.least,
         sentence=f"{format_count(near)} events ({format_percent(share)}) within 20 µs of the same "
-        f"pixel's last of the same polarity, {format_count(rest)} from there to 400 µs",
+        f"pixel's last of the same polarity, {format_count(rest)} from there to 400 µs{at_once}",
         details={"near": near, "later": rest, "at_once": ties},
     )  # fmt: skip
     unseen = f"{format_percent(share)} of the events within 20 µs of the same pixel's last"
@@ -140,3 +185,14 @@ def find_double_events(
         reason = f"{format_percent(ties / events)} of the events come at the time of the same pixel's last"
         return replace(found, answer=Answer.CANNOT_SAY, sentence=f"{reason}: a delay or a slow clock")
     return found
+
+
+def _chance_of(intervals: IntervalCounts, some: NDArray[np.bool_]) -> float:
+    """Return p of the null for some pixels, shape (H * W,); 1 if there are too few doubles."""
+    s, chance = intervals.settings, intervals.settings.near / intervals.settings.far
+    soon, later = (int(row[0, some].sum()) for row in intervals.counts[3:])
+    if soon * (1 / chance - 1) < s.ratio * later:
+        return 1.0  # fast, but no faster than fast
+    if not soon or soon < s.least * intervals.events[0, some].sum():
+        return 1.0  # others have caught up with each other
+    return float(stats.binom.sf(soon - 1, soon + later, chance))

@@ -129,6 +129,7 @@ class _SecondPass:
     def finish(self) -> None:
         """Take the events that were held back."""
         self._take_calm(*self._filter.flush())
+        self.intervals.finish()
 
     def _take_calm(self, events: Events, calm: NDArray[np.bool_]) -> None:
         chosen = events.select(calm)

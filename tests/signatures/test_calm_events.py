@@ -8,7 +8,7 @@ import pytest
 from dase.events import Events
 from dase.signatures.calm_events import CalmFilter, CalmShare
 from dase.signatures.clock import ClockCounts, ClockSettings
-from dase.signatures.double_events import DoubleSettings, IntervalCounts
+from dase.signatures.double_events import DoubleSettings, IntervalCounts, times_of_many
 
 
 def some(rng, count=600, width=23, height=17, duration=0.5):
@@ -52,17 +52,23 @@ def test_calm_share_equals_a_loop(rng, size):
 @pytest.mark.parametrize("size", [600, 7])
 def test_short_intervals_equal_a_loop(rng, size):
     e = some(rng, width=3, height=2)
-    looked = IntervalCounts(3, 2, DoubleSettings(tie=1e-4, near=1e-3, far=5e-3))
+    looked = IntervalCounts(3, 2, DoubleSettings(tie=1e-4, near=1e-3, far=5e-3, shared=0.05))
     for part in pieces(e, size):
         looked.push(part)
+    looked.finish()
     pixel = e.y.astype(int) * 3 + e.x
+    away = np.abs(e.t[:, None] - e.t)
+    at_once, around = ((away <= reach + 1e-12).sum(1) - 1 for reach in (1e-4, 5e-3))
+    own_time = at_once <= 0.05 * around
+    assert np.array_equal(times_of_many(e.t, slice(50, 90), looked.settings), ~own_time[50:90])
+    assert 0.1 < own_time.mean() < 0.9
     for k in range(6):
-        t, p = e.t[pixel == k], e.p[pixel == k]
+        t, p, alone = e.t[pixel == k], e.p[pixel == k], own_time[pixel == k][1:]
         gaps, same = np.diff(t), p[1:] == p[:-1]
         calm = same & (np.concatenate(([np.inf], gaps[:-1])) >= 5e-3 - 1e-9)
         for polarity in (False, True):
             rows = []
-            for chosen in (same, calm):
+            for chosen in (same, calm & alone):
                 own = gaps[chosen & (p[1:] == polarity)]
                 below = [np.count_nonzero(own < limit - 1e-9) for limit in (1e-4, 1e-3, 5e-3)]
                 rows.append(np.diff(below, prepend=0).tolist())

@@ -289,6 +289,40 @@ def test_events_that_a_delay_lets_catch_up_are_not_double():
     assert found(made(**late, double_events={"share": 0.02})) == {"double events"}
 
 
+def in_turn(rng, share, most=4, frames=400, pixels=900):
+    """Events of a simulator that gives those of a frame of 1 ms a few times, the same for all pixels.
+
+    A `share` has a double 1 to 60 us later.
+    """
+    t, pixel = [], []
+    for frame in range(frames):
+        parts = int(rng.integers(2, most + 1))
+        some = rng.permutation(pixels)[:150]
+        for part in range(1, parts + 1):  # ever fewer pixels send once more
+            t.append(np.full(len(some), np.round(1000 * (frame + part / parts))))
+            pixel.append(some)
+            some = some[: len(some) // 2]
+    t, pixel = np.concatenate(t), np.concatenate(pixel)
+    again = rng.random(len(t)) < share
+    t = np.concatenate([t, t[again] + rng.integers(1, 61, np.count_nonzero(again))])
+    pixel = np.concatenate([pixel, pixel[again]])
+    order = np.argsort(t, kind="stable")
+    x, y = ((pixel[order] % 30).astype(np.uint16), (pixel[order] // 30).astype(np.uint16))
+    return Events(t[order] * 1e-6, x, y, np.zeros(len(t), bool), 30, 30)
+
+
+def test_double_events_show_beside_events_that_a_simulator_gives_parts_of_a_frame(rng):
+    entry = dase.find_signatures(in_turn(rng, 0.04))["double events"]
+    assert entry.found
+    assert entry.sentence.endswith("most of these where many pixels send at one time")
+    assert 19 * entry.details["near"] < entry.details["later"]  # they would be no more than chance
+
+
+@pytest.mark.parametrize("most", [4, 30, 100])
+def test_events_at_parts_of_a_frame_are_not_double(rng, most):
+    assert not dase.find_signatures(in_turn(rng, 0.0, most))["double events"].found
+
+
 def test_weak_bursts_that_take_turns_are_no_lamp():
     """ON and OFF bursts half a frame's exposure apart are strongest at twice the frame rate."""
     events = made(kind="objects", exposure={"amplitude": 0.1, "period": 0.04, "exposure": 0.01})
