@@ -7,6 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from helpers.brief_diagnosis import NO_LIMITS
 
 import dase
 from dase.diagnosis import seen_beside_model
@@ -164,7 +165,7 @@ def test_a_dead_time_that_hardly_loses_events_is_certain():
     events = dase.simulate(scene, base.with_effect(EFFECTS["refractory"](period=period, mode="drop")), seed=1)
     assert abs(len(events) / len(dase.simulate(scene, base, seed=1)) - 1) < 0.02
     # the intervals of all pixels tell, however few are fitted
-    diagnosis = dase.diagnose(events, base, scene=scene, pixels=400, seed=0)
+    diagnosis = dase.diagnose(events, base, scene=scene, pixels=400, seed=0, settings=NO_LIMITS)
     grades = {one.effect: one for one in diagnosis.findings}
     assert grades["refractory"].grade.value == "certain"
     assert "within" in grades["refractory"].seen

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from helpers.brief_diagnosis import NO_LIMITS
 
 import dase
 from dase.diagnosis.diagnose import diagnose
@@ -46,7 +47,7 @@ def test_few_hot_pixels_are_counted_and_their_law_is_found(events):
 
 def test_noise_is_found_beside_a_few_hot_pixels(events):
     scene = static_scene(events)
-    found = diagnose(events, scene=scene, effects=LIBRARY, pixels=400, most=2)
+    found = diagnose(events, scene=scene, effects=LIBRARY, pixels=400, most=2, settings=NO_LIMITS)
     grades = {one.effect: str(one.grade) for one in found.findings}
     assert grades["hot"] == "certain"
     assert "hot" in found.selected

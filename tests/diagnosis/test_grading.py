@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import cv2
 import numpy as np
 import pytest
+from helpers.brief_diagnosis import NO_LIMITS
 
 import dase
 from dase.diagnosis import grading, seen_effects
@@ -158,7 +159,7 @@ def test_what_reports_chooses_nothing(scene, events, found):
     mine = np.isin(events.y.astype(np.int64) * scene.width + events.x, apart)
     # at the time that reports; what comes before tells how fast a lamp flickers, wherever it is seen
     others = events.select(~mine | (events.t < 0.5) | (rng.random(len(events)) < 0.7))
-    other = diagnose(others, scene=scene, effects=LIBRARY, pixels=400, most=1)
+    other = diagnose(others, scene=scene, effects=LIBRARY, pixels=400, most=1, settings=NO_LIMITS)
     ways = [[(r.effect, r.error) for s in one.history for r in s.ranking] for one in (found, other)]
     assert ways[0]
     assert repr(ways[0]) == repr(ways[1])

@@ -177,7 +177,7 @@ def test_a_moving_recording_that_is_declared_static_is_seen_by_its_neighbours(sc
     Shot noise explains the texture to an error below the gate; only neighbours tell that it is none.
     """
     moving = dase.simulate(scene(), Sensor(), seed=4)
-    found = diagnose(moving, scene="static", pixels=200)
+    found = diagnose(moving, scene="static", pixels=200, settings=NO_LIMITS)
     assert found.selected == ()
     assert found.unexplained is not None
     assert "contradict a scene at rest" in found.finding()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from helpers.brief_diagnosis import NO_LIMITS
 
 import dase
 from dase.diagnosis import compared_measurement
@@ -202,7 +203,8 @@ LIBRARY = {name: EFFECTS[name] for name in ("threshold", "mismatch", "dead")}
 
 def test_dead_pixels_are_certain_and_left_out_of_the_search(scene):
     true = Sensor().with_effect(EFFECTS["mismatch"](spread=0.2)).with_effect(EFFECTS["dead"](share=0.02))
-    found = diagnose(dase.simulate(scene, true, seed=5), scene=scene, effects=LIBRARY, pixels=200, most=2)
+    events = dase.simulate(scene, true, seed=5)
+    found = diagnose(events, scene=scene, effects=LIBRARY, pixels=200, most=2, settings=NO_LIMITS)
     grades = {one.effect: one.grade for one in found.findings}
     assert grades["dead"] is Grade.CERTAIN
     assert grades["mismatch"] is Grade.CERTAIN
@@ -233,7 +235,7 @@ def test_all_of_the_time_is_fitted_where_light_comes_to_rest():
         Measurement(dase.simulate(restless, true), restless), pixels=200
     ).parts_differ
     library = {name: EFFECTS[name] for name in ("threshold", "mismatch", "leak", "hot")}
-    found = diagnose(events, scene=scene, effects=library, pixels=130, most=3)
+    found = diagnose(events, scene=scene, effects=library, pixels=130, most=3, settings=NO_LIMITS)
     assert set(found.selected) == {"leak", "mismatch"}
     assert found.errors[-1] < found.gate
     assert any("all of it is fitted" in note for note in found.notes)
@@ -252,7 +254,7 @@ def test_what_comes_late_is_fitted_there():
     late, early = (dase.simulate(scene, one, seed=3) for one in (true, silent))
     events = dase.Events.concatenate([early.select(early.t < 0.73), late.select(late.t >= 0.73)])
     library = {name: EFFECTS[name] for name in ("threshold", "mismatch", "leak")}
-    found = diagnose(events, scene=scene, effects=library, pixels=200, most=2)
+    found = diagnose(events, scene=scene, effects=library, pixels=200, most=2, settings=NO_LIMITS)
     assert any("what is left comes late" in note for note in found.notes)
     # the measurement is of no one sensor, so more than that it is seen is not asked
     assert "leak" in {one.effect for one in found.findings}

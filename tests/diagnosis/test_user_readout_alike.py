@@ -7,6 +7,7 @@ from typing import ClassVar, Self
 
 import numpy as np
 import pytest
+from helpers.brief_diagnosis import NO_LIMITS
 
 import dase
 from dase.diagnosis.diagnose import diagnose
@@ -131,7 +132,7 @@ def test_a_users_readout_is_diagnosed_as_that_of_dase(hidden, own, users, device
     found = [
         diagnose(
             events, scene=scene, effects={"threshold": THRESHOLD.__class__, e.name: e},
-            pixels=100, most=1, device=device,
+            pixels=100, most=1, device=device, settings=NO_LIMITS,
         )
         for e in (own, users)
     ]  # fmt: skip

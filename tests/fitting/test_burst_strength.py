@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from helpers.brief_diagnosis import NO_LIMITS
 
 import dase
 from dase.diagnosis.seen_effects import find_seen_effects
@@ -112,7 +113,9 @@ def test_a_diagnosis_finds_and_measures_the_coupling(scene):
     assert any(entry.name == "frame coupling" for entry in find_signatures(events).found)
     # those that come nearest to it in a diagnosis which is not told of the bursts
     library = {name: EFFECTS[name] for name in ("exposure", *LIKE_BURSTS)}
-    found = dase.diagnose(events, sensor, scene=scene, effects=library, pixels=300, most=1)
+    found = dase.diagnose(
+        events, sensor, scene=scene, effects=library, pixels=300, most=1, settings=NO_LIMITS
+    )
     assert found.selected == ("exposure",)
     assert [one.grade for one in found.findings] == [Grade.CERTAIN]
     got = found.sensor["exposure"]

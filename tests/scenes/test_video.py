@@ -211,30 +211,34 @@ def test_titles_that_a_cut_left_half_are_no_harm(tmp_path, rng):
 
 def test_a_damaged_video_takes_little_memory_and_says_nothing_else(tmp_path, rng):
     """FFmpeg fills what titles claim with zeros: half a gigabyte here, were it let to."""
-    script = """
-import sys
-import dase.io, dase.scenes.video
-before, sentence = peak(), "read"
-try:
-    dase.io.read(sys.argv[1])
-except dase.InputError as error:
-    sentence = str(error)
-print(peak() - before, sentence)
-"""
     if not Path("/proc/self/status").exists():
         pytest.skip("reads the memory of a process from /proc, which only Linux has")
-    grey, path = rng.integers(0, 256, (4, 6, 8), np.uint8), tmp_path / "a.avi"
+    script = """
+import dase.io, dase.scenes.video
+def read(path):
+    before, sentence = peak(), "read"
+    try:
+        dase.io.read(path)
+    except dase.InputError as error:
+        sentence = str(error)
+    print(peak() - before, sentence)
+apart(read)
+"""
+    grey, paths, sentences = rng.integers(0, 256, (4, 6, 8), np.uint8), [], []
     for damaged, sentence in (
         (avi(grey, first=titles(1 << 29)), "bytes of titles"),
         (avi(grey, first=b"LIST"), "^read$"),
         (avi(grey)[:300], "cannot be decoded|at least 2 frames"),
         (avi(grey).replace(b"hdrl", b"hdxl"), "cannot be decoded|at least 2 frames|^read$"),
     ):
-        path.write_bytes(damaged)
-        command = [sys.executable, "-c", PEAK + script, str(path)]
-        done = subprocess.run(command, capture_output=True, text=True, check=True)
-        assert done.stderr == ""
-        grown, said = done.stdout.split(" ", 1)
+        paths.append(tmp_path / f"{len(paths)}.avi")
+        paths[-1].write_bytes(damaged)
+        sentences.append(sentence)
+    command = [sys.executable, "-c", PEAK + script, *map(str, paths)]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert done.stderr == ""
+    for line, sentence in zip(done.stdout.splitlines(), sentences, strict=True):
+        grown, said = line.split(" ", 1)
         assert float(grown) < 200
         assert re.search(sentence, said)
 
