@@ -14,7 +14,14 @@ from dase.effects.optics_blur import OpticsBlur
 from dase.errors import InputError
 from dase.fitting.data_split import SPLIT, ModelPremises, split_measurement
 from dase.fitting.fit import fit
-from dase.fitting.measurement import Measured, Measurement, SceneChoice, as_measurement
+from dase.fitting.measurement import (
+    Measured,
+    Measurement,
+    SceneChoice,
+    as_measurement,
+    lens_of,
+    with_lens,
+)
 from dase.fitting.model import fit_present_model
 from dase.probes.random_streams import SimulationStream
 from dase.probes.stimulus import Trust
@@ -60,7 +67,9 @@ def fit_added(
     tell = progress or (lambda text, share, error: None)
     without = as_sensor(sensor)
     measurement = as_measurement(measured, scene, trust).through_lens_of(without)
-    without, effect = without.bound_to(measurement.scene), effect.bound_to(measurement.scene)
+    lens = lens_of(without)
+    without = without.without(OpticsBlur.name).bound_to(measurement.scene)
+    effect = effect.bound_to(measurement.scene)
     if isinstance(effect, SceneEffect):
         effect = _as_lens_before_clip(effect, measurement)
     premises = ModelPremises(without.log_eps, unbroken=without.unbroken or effect.unbroken)
@@ -78,14 +87,13 @@ def fit_added(
             behind = split_measurement(seen, models=premises, pixels=pixels, seed=seed, device=device)
             return error_of_choice(behind, fit_present_model(behind, without, None, seed=seed), seed=seed)
 
-        lens = OpticsBlur(sigma=best_width(left) or effect.sigma)
-        sensor = without.with_effect(lens)
-        return before, fit(measurement, sensor, pixels=pixels, seed=seed, device=device, progress=progress)
+        found = with_lens(without, OpticsBlur(sigma=best_width(left) or effect.sigma))
+        return before, fit(measurement, found, pixels=pixels, seed=seed, device=device, progress=progress)
     # far from where it is, a descent could end in the wrong place
     calibrated = calibrate_split(
         evidence, present, repeats=DEFAULTS.repeats, scout_repeats=DEFAULTS.scout_repeats, seed=seed
     )
-    start = screen_and_descend(calibrated, present, effect, seed=seed).model.sensor
+    start = with_lens(screen_and_descend(calibrated, present, effect, seed=seed).model.sensor, lens)
     fitted = fit(measurement, start, pixels=pixels, seed=seed, device=device, progress=progress)
     return before, fitted
 
@@ -94,7 +102,7 @@ def _as_lens_before_clip(effect: SceneEffect, measurement: Measurement) -> Optic
     """Return what acts on pictures as the lens before a clip that it has to be to be fitted."""
     if not isinstance(effect, OpticsBlur):
         raise InputError(f"{effect.name} acts on pictures, and cannot be fitted: add it without a recording")
-    if not isinstance(measurement.scene, VideoScene):
+    if not isinstance(measurement.scene, VideoScene) or measurement.scene.sharp is not None:
         raise InputError(
             f"{effect.name} can be fitted where the scene is a clip, which knows no lens: what else is known "
             "of a scene, such as a camera's own frames, is as blurred as the events"

@@ -16,7 +16,7 @@ from dase.diagnosis.grading import grade_of, judge_on_report
 from dase.diagnosis.state import DiagnosisTask
 from dase.effects.optics_blur import OpticsBlur
 from dase.fitting.data_split import SplitMeasurement
-from dase.fitting.measurement import Measurement
+from dase.fitting.measurement import Measurement, with_lens
 from dase.fitting.model import FittedModel, fit_present_model, model_of, refit_model
 from dase.probes.random_streams import SimulationStream
 from dase.results import Diagnosis, Estimate, Finding, Grade
@@ -156,8 +156,7 @@ def with_blurred_lens(
     found = Finding(
         EFFECT, grade, unknown=unknown, error_without=without.error, error_with=last.error, parameters=mine
     )
-    sharp_sensor = diagnosis.sensor.without(EFFECT)
-    out = replace(diagnosis, before=given.error, sensor=sharp_sensor)
+    out = replace(diagnosis, before=given.error)
     if grade is Grade.STAND_IN:
         return replace(out, stand_ins=(*out.stand_ins, found))
     out = replace(out, findings=(*out.findings, found))
@@ -165,7 +164,7 @@ def with_blurred_lens(
         return out
     return replace(
         out,
-        sensor=out.sensor.with_effect(OpticsBlur(sigma=width.value)),
+        sensor=with_lens(out.sensor, OpticsBlur(sigma=width.value)),
         selected=(EFFECT, *out.selected),
         errors=(first.error, *out.errors),
         parameters={**mine, **out.parameters},
@@ -177,7 +176,7 @@ def behind_lens(measurement: Measurement, width: float) -> Measurement:
     lens = OpticsBlur(sigma=width)
     scene = measurement.scene
     bare = replace(measurement, scene=(scene.sharp or scene) if isinstance(scene, VideoScene) else scene)
-    return replace(bare.through_lens_of(Sensor().with_effect(lens)), lens=lens)
+    return replace(bare.through_lens_of(with_lens(Sensor(), lens)), lens=lens)
 
 
 def _beside(width: float, octaves: float) -> tuple[float, float]:

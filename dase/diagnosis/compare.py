@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 from dase.diagnosis.cell_descriptions import band_in_words, worst_cells
 from dase.diagnosis.settings import DEFAULTS, DiagnosisSettings
+from dase.effects.optics_blur import OpticsBlur
 from dase.fitting.data_split import SPLIT, ModelPremises, SplitMeasurement, split_measurement
-from dase.fitting.measurement import Measured, SceneChoice, as_measurement
+from dase.fitting.measurement import Measured, SceneChoice, as_measurement, lens_of, with_lens
 from dase.fitting.model import model_of
 from dase.fitting.plain_numbers import family_counts, octave_ends, plain_numbers, rate_counts
 from dase.fitting.subset import CalibratedSubset
@@ -63,7 +64,8 @@ def compare(
     tell("reading the measurement", 0.0, float("nan"))
     model = as_sensor(sensor)
     measurement = as_measurement(measured, scene, trust).through_lens_of(model)
-    model = model.bound_to(measurement.scene)
+    lens = lens_of(model)
+    model = model.without(OpticsBlur.name).bound_to(measurement.scene)
     premises = ModelPremises(model.log_eps, unbroken=model.unbroken)
     evidence = split_measurement(measurement, models=premises, pixels=pixels, seed=seed, device=device)
     tell("simulating", 0.3, float("nan"))
@@ -72,7 +74,9 @@ def compare(
     held = model_of(model, []).calibrate(evidence.held, repeats=settings.repeats, seed=stream)
     judgement = held.judge(stream)
     tell("comparing", 1.0, judgement.error)
-    found = comparison_of(evidence, held, judgement, model, seconds=time.perf_counter() - begin)
+    found = comparison_of(
+        evidence, held, judgement, with_lens(model, lens), seconds=time.perf_counter() - begin
+    )
     return measurement.noted(found)
 
 

@@ -33,9 +33,10 @@ from dase.diagnosis.state import DiagnosisState, DiagnosisTask
 from dase.diagnosis.unequal_thresholds import EFFECT as MISMATCH
 from dase.diagnosis.unequal_thresholds import with_unequal_thresholds
 from dase.effects import EFFECTS, Effect
+from dase.effects.optics_blur import OpticsBlur
 from dase.fitting.burst_strength import BurstStrength, put_in_step
 from dase.fitting.data_split import SPLIT
-from dase.fitting.measurement import Measured, SceneChoice, as_measurement
+from dase.fitting.measurement import Measured, SceneChoice, as_measurement, lens_of, with_lens
 from dase.fitting.model import (
     FittedModel,
     fit_present_model,
@@ -101,9 +102,8 @@ def diagnose(
     given = Sensor() if sensor is None else as_sensor(sensor)
     refuse_idle(given, free)
     measurement = as_measurement(measured, scene, trust).through_lens_of(given)
-    given = given.bound_to(measurement.scene)
-    if measurement.lens is not None:
-        given = given.with_effect(measurement.lens)
+    lens = lens_of(given)
+    given = given.without(OpticsBlur.name).bound_to(measurement.scene)
     tell("looking at the events alone", 0.0, float("nan"))
     compared = choose_compared(
         measurement, given, effects, pixels=pixels, seed=seed, device=device, settings=settings
@@ -137,7 +137,8 @@ def diagnose(
     found = _with_what_pixels_show(found, state.task, compared, seen, model, strength)
     if measurement.lens is not None:
         found = with_blurred_lens(found, state.task, compared, start, model)
-    return measurement.noted(replace(found, seconds=time.perf_counter() - begin))
+    found = replace(found, sensor=with_lens(found.sensor, lens), seconds=time.perf_counter() - begin)
+    return measurement.noted(found)
 
 
 def _begin_search(
@@ -178,7 +179,7 @@ def _begin_search(
         evidence, compared.candidates(effects), compared.seed, tell,
         frozenset(effect.name for effect in given.effects), settings,
         frame_held=compared.measurement.held, grey_step=grey_step_of(compared.measurement.scene),
-        all_time=all_time,
+        all_time=all_time, lens=compared.measurement.lens,
     )  # fmt: skip
     return DiagnosisState(task, notes=notes), given, free
 

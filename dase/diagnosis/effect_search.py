@@ -64,7 +64,7 @@ def search_effects(
         model = _fit_all_of_the_time(state, compared, model, judgement)
         model, judgement = _add_one_by_one(state, compared, model, _left_to_add(state.task, model, most))
     task = state.task  # the measurement is split no more
-    if most > 0 and not reaches_floor(judgement) and LENS in task.effects and LENS not in task.given:
+    if most > 0 and not reaches_floor(judgement) and LENS in task.effects:
         task.progress("looking at the lens", 0.0, judgement.error)
         known = task.given | state.path.certain
         state.other_scene = seen_through_a_lens(

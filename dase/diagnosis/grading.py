@@ -32,7 +32,9 @@ from dase.diagnosis.candidates import Candidate
 from dase.diagnosis.directional_test import deviation_towards
 from dase.diagnosis.settings import GradeSettings
 from dase.diagnosis.state import DiagnosisTask, SearchPath, with_same_freedom
+from dase.effects.optics_blur import OpticsBlur
 from dase.fitting.early_stopping import CandidateRace
+from dase.fitting.measurement import with_lens
 from dase.fitting.model import FittedModel, refit_work
 from dase.fitting.scene_doubt import misfit_beyond_chance
 from dase.fitting.scheduler import run_side_by_side
@@ -127,7 +129,7 @@ def grade_effects(
         doubtful = any(
             is_strained(model, *one)
             or is_between_samples(model, *one, shortest=shortest)
-            or is_small_beside_another(model, *one)
+            or is_small_beside_another(model, *one, lens=task.lens)
             or is_below_black(model, *one, grey=settings.black_greys * task.grey_step)
             for one in mine[name].items()
         )
@@ -197,12 +199,21 @@ def is_between_samples(model: FittedModel, name: str, value: Estimate, *, shorte
     return fact is not None and fact.between_samples and value.high < shortest
 
 
-def is_small_beside_another(model: FittedModel, name: str, value: Estimate) -> bool:
-    """Return whether another way of an effect beside it looks like one as weak as this."""
+def is_small_beside_another(
+    model: FittedModel, name: str, value: Estimate, *, lens: OpticsBlur | None = None
+) -> bool:
+    """Return whether another way of an effect beside it looks like one as weak as this.
+
+    Args:
+        model: Has the parameter.
+        name: Of the parameter.
+        value: Its estimate.
+        lens: Beside it as well, where a clip is seen through one.
+    """
     fact = next((axis.fact for axis in model.space.axes if axis.name == name), None)
     if fact is None:
         return False
-    sensor = model.sensor
+    sensor = with_lens(model.sensor, lens)
     return any(
         other in sensor and not sensor[other].is_off() and value.value < least
         for other, least in fact.clear_beside

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, replace
 from dase.diagnosis.candidates import Candidate
 from dase.diagnosis.settings import DEFAULTS, DiagnosisSettings
 from dase.effects import Effect
+from dase.effects.optics_blur import OpticsBlur
 from dase.fitting.data_split import SplitMeasurement
 from dase.fitting.measurement import Measurement
 from dase.fitting.model import FittedModel, free_of, model_of, still_free
@@ -35,6 +36,7 @@ class DiagnosisTask:
         frame_held: Time for which each frame of a clip is held [s], see `Measurement.held`.
         grey_step: Between two greys of a clip of 8 bits [intensity]; 0 of other scenes.
         all_time: Whether all of the time is fitted, not its first part alone.
+        lens: Through which a clip is seen, where the search before has told it; None without one.
     """
 
     evidence: SplitMeasurement
@@ -46,6 +48,7 @@ class DiagnosisTask:
     frame_held: float = 0.0
     grey_step: float = 0.0
     all_time: bool = False
+    lens: OpticsBlur | None = None
 
     def judge(self, model: FittedModel, *, repeats: int | None = None) -> Judgement:
         """Return the held-out error of a model."""

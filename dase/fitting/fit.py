@@ -11,10 +11,11 @@ from statistics import NormalDist
 
 import numpy as np
 
+from dase.effects.optics_blur import OpticsBlur
 from dase.fitting.burst_strength import find_frame_times, follows_frames, put_in_step
 from dase.fitting.confidence_intervals import REPEATS, estimate_parameters
 from dase.fitting.data_split import SPLIT, ModelPremises, SplitMeasurement, split_measurement
-from dase.fitting.measurement import Measured, SceneChoice, as_measurement
+from dase.fitting.measurement import Measured, SceneChoice, as_measurement, lens_of, with_lens
 from dase.fitting.model import (
     PHASED,
     REFIT,
@@ -101,8 +102,8 @@ def fit(
     model_of(start, free)  # refuses names that are not there before anything takes time
     refuse_idle(start, free)
     measurement = as_measurement(measured, scene, trust).through_lens_of(start)
-    scene = measurement.scene
-    start = start.bound_to(scene)
+    scene, lens = measurement.scene, lens_of(start)
+    start = start.without(OpticsBlur.name).bound_to(scene)
     follows = follows_frames(start)
     frames = find_frame_times(measurement) if follows else None
     untold = follows and frames is None
@@ -147,7 +148,7 @@ def fit(
         *(notes_on_screen(model.sensor, scene.stimulus) if isinstance(scene, ScreenScene) else []),
     ]
     found = Fit(
-        sensor=model.sensor,
+        sensor=with_lens(model.sensor, lens),
         parameters=values,
         error=judgement.error,
         before=before,

@@ -106,8 +106,7 @@ class Measurement:
         Args:
             sensor: Its `optics_blur` is the lens; without one, or with one that is off, nothing changes.
         """
-        lens = next((one for one in sensor.effects if isinstance(one, OpticsBlur)), None)
-        scene = self.scene
+        lens, scene = lens_of(sensor), self.scene
         if lens is None or lens.is_off() or isinstance(scene, CameraScene | ScreenScene):
             return self
         if isinstance(scene, VideoScene):
@@ -127,6 +126,19 @@ class Measurement:
     def noted(self, found: Found) -> Found:
         """Return a finding with what was noticed while reading before its own notes."""
         return replace(found, notes=(*self.notes, *found.notes))
+
+
+def lens_of(sensor: Sensor) -> OpticsBlur | None:
+    """Return the lens of a sensor; None without one.
+
+    What is compared is already seen through it, see `Measurement.through_lens_of`: models have none.
+    """
+    return next((one for one in sensor.effects if isinstance(one, OpticsBlur)), None)
+
+
+def with_lens(sensor: Sensor, lens: OpticsBlur | None) -> Sensor:
+    """Return a sensor with a lens, if there is one."""
+    return sensor if lens is None else sensor.with_effect(lens)
 
 
 Measured = Measurement | Recording | Events | str | PathLike[str]
