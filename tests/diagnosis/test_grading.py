@@ -149,17 +149,17 @@ def events(scene) -> dase.Events:
 
 @pytest.fixture(scope="module")
 def found(scene, events) -> dase.Diagnosis:
-    return diagnose(events, scene=scene, effects=LIBRARY, pixels=400, most=1)
+    return diagnose(events, scene=scene, effects=LIBRARY, pixels=250, most=1)
 
 
 def test_what_reports_chooses_nothing(scene, events, found):
     """The search goes the same way whatever the pixels saw that report; what is said of its end differs."""
-    apart = split_measurement(Measurement(events, scene), pixels=400).report.trials.stimulus.pixels
+    apart = split_measurement(Measurement(events, scene), pixels=250).report.trials.stimulus.pixels
     rng = np.random.default_rng(0)
     mine = np.isin(events.y.astype(np.int64) * scene.width + events.x, apart)
     # at the time that reports; what comes before tells how fast a lamp flickers, wherever it is seen
     others = events.select(~mine | (events.t < 0.5) | (rng.random(len(events)) < 0.7))
-    other = diagnose(others, scene=scene, effects=LIBRARY, pixels=400, most=1, settings=NO_LIMITS)
+    other = diagnose(others, scene=scene, effects=LIBRARY, pixels=250, most=1, settings=NO_LIMITS)
     ways = [[(r.effect, r.error) for s in one.history for r in s.ranking] for one in (found, other)]
     assert ways[0]
     assert repr(ways[0]) == repr(ways[1])

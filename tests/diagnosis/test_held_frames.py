@@ -188,7 +188,7 @@ def test_a_low_pass_from_frame_to_frame_is_asked_for_where_another_leaves_too_mu
     scene = shaken_texture(gap=6e-3, length=0.5)
     events = filtered_at_frames(scene, cutoff=60.0, spread=0.0)
     tried = {name: EFFECTS[name] for name in ("bandwidth", "second_order", "leak")}
-    found = dase.diagnose(events, "ideal", scene=scene, effects=tried, most=1, pixels=200, settings=NO_LIMITS)
+    found = dase.diagnose(events, "ideal", scene=scene, effects=tried, most=1, pixels=120, settings=NO_LIMITS)
     assert found.selected == ("second_order",)
     assert found.errors[-1] < 1
     slow = found.sensor["second_order"]

@@ -219,7 +219,7 @@ def test_what_is_at_the_end_of_its_search_is_not_announced(monkeypatch):
     assert parameters_at_bounds(at_end, unknown) == []
     assert len(said) == 1
     assert said[0].startswith("threshold.on = 3 ")
-    scene = moving_bars()
+    scene = moving_bars(duration=0.4)
     events = dase.simulate(scene, Sensor().with_effect(EFFECTS["bandwidth"](cutoff=60.0)), seed=4)
     library = {name: EFFECTS[name] for name in ("threshold", "bandwidth")}
     announced = []
