@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from dase.diagnosis.doubles_of_jumps import find_doubles_at_small_jumps
 from dase.diagnosis.frames_at_rest import events_where_frames_rest
 from dase.diagnosis.led_pixels import follow_the_light
 from dase.effects import EFFECTS, Effect
@@ -255,10 +256,10 @@ def find_seen_effects(measurement: Measurement, library: Mapping[str, type[Effec
 def _is_of_frames(entry: Signature, step: float, events: Events, scene: Scene) -> bool:
     """Return whether ticks or bursts of events in step with frames, every `step` [s], are made by these.
 
-    Of frames that are held all events come so long after one, and a jump sends many at once. Where all events
-    come in step with frames, all are in bursts: a simulator that knows these frames alone sends no others.
+    Of frames that are held all events come so long after one. Where all events come in step with frames, all
+    are in bursts: a simulator that knows these frames alone sends no others.
     """
-    if entry.name in (TIME_STAMPS, DOUBLE_EVENTS) and is_held(scene):
+    if entry.name == TIME_STAMPS and is_held(scene):
         return True
     if entry.name == FRAME_COUPLING:
         return step > 0 and is_in_step(1 / entry.details["interval"], step)
@@ -322,6 +323,8 @@ def without_the_scene(seen: SeenEffects, measurement: Measurement, sensor: Senso
         seen = replace(
             seen, entries=tuple(one for one in seen.entries if _is_at_rest(one, measurement, scene))
         )
+    if is_held(scene):
+        seen = _with_doubles(seen, find_doubles_at_small_jumps(measurement.compared_events(), scene, sensor))
     asked = _asked_of_scene(seen.entries, scene)
     if not asked:
         return seen
@@ -333,6 +336,13 @@ def without_the_scene(seen: SeenEffects, measurement: Measurement, sensor: Senso
             kept = tuple(entry for entry in kept if entry not in more or not shows_in(made, entry))
     coupled = any(entry.name == FRAME_COUPLING for entry in kept)
     return replace(seen, entries=kept, bursts=seen.bursts if coupled else None)
+
+
+def _with_doubles(seen: SeenEffects, found: Signature) -> SeenEffects:
+    """Return what is seen, with what is `found` of double events in place of what was."""
+    entries = (*(one for one in seen.entries if one.name != DOUBLE_EVENTS), *([found] if found.found else []))
+    absent = tuple(one for one in seen.absent if one.name != DOUBLE_EVENTS or not found.found)
+    return replace(seen, entries=entries, absent=absent)
 
 
 def part_to_simulate(measurement: Measurement, when: NDArray[np.float64]) -> Measurement:
