@@ -50,7 +50,7 @@ from dase.probes.random_streams import SimulationStream
 from dase.probes.stimulus import Trust
 from dase.results import Diagnosis, Progress, is_worse
 from dase.scenes.grey_steps import grey_step_of
-from dase.signatures.kinds import DEAD_TIME, UNEQUAL_THRESHOLDS
+from dase.signatures.kinds import DEAD_TIME, DOUBLE_EVENTS, UNEQUAL_THRESHOLDS
 from dase.simulation.sensor import Sensor
 from dase.simulation.sensor_file import as_sensor
 
@@ -116,6 +116,8 @@ def diagnose(
         return replace(again(shown), seconds=time.perf_counter() - begin)
     part = part_to_simulate(measurement, state.task.evidence.when)
     seen = without_the_scene(compared.seen, part, start.sensor, seed)
+    if seen.entry_of(DOUBLE_EVENTS) is not None:
+        state.try_doubles()
     if compared.guessed is not None:
         tell("how well the scene is known", 0.0, before)
         state.doubt_scene(with_scene_doubt(state.task.evidence, compared.guessed, start, seed=seed))

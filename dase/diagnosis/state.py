@@ -158,9 +158,14 @@ class DiagnosisState:
         """Go on with the same parts of the measurement, with what their scene is not known to."""
         self.task = replace(self.task, evidence=evidence)
 
+    def try_doubles(self) -> None:
+        """Let double events be tried: they are seen, and not of the scene."""
+        self.task = replace(self.task, evidence=replace(self.task.evidence, doubles=True))
+
     def split_anew(self, evidence: SplitMeasurement) -> None:
         """Go on with a split of which all of the time is fitted; what was run before counts on."""
         self.evaluations_before, self.samples_before = self.evaluations, self.samples
+        evidence = replace(evidence, doubles=self.task.evidence.doubles)
         self.task = replace(self.task, evidence=evidence, all_time=True)
 
     def count_as_given(self, name: str) -> None:

@@ -123,8 +123,8 @@ class DoubleEvents(StreamEffect):
 
     @classmethod
     def candidates(cls, observed: Observations) -> list[Self]:
-        """Return nothing: doubles are seen in the events themselves, see the signature of double events."""
-        return []
+        """Return them where they are seen in the events themselves, see the signature of double events."""
+        return [cls()] if observed.doubles else []
 
     def longest_delay(self, lines: int) -> float:
         """Return infinity where there are doubles: they are more events, however soon they come."""
