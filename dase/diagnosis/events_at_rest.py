@@ -5,7 +5,8 @@ events that go on for as long as it rests are noise, and ON events alone are a l
 describes the rest. Noise of the voltage crosses a threshold and returns, so its events take turns; those of
 shot noise know nothing of each other. A low-pass, a dead time or a full bus send some events after the light
 has come to rest, soon and of one polarity; hot pixels are a few that send much; a lamp makes all pixels send
-together. None of these is taken for noise.
+together. Behind a lens that is less sharp than the scene a pixel sees its neighbours move. None of these is
+taken for noise.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
-from scipy.ndimage import uniform_filter1d
+from scipy.ndimage import maximum_filter, minimum_filter, uniform_filter1d
 
 from dase.diagnosis.light_between_events import times_that_are_compared
 from dase.effects.threshold import Threshold
@@ -76,7 +77,17 @@ class EventsAtRestSettings:
     """Share of OFF events beside a leak, at most."""
 
     goes_on: float = 0.25
-    """Share of the events in the later half of the rests: what is left of motion comes soon."""
+    """Share of the events in the later half of the rests, at least, and beyond the time after motion up to
+    which half of all rests lies: what is left of motion comes soon, and short rests have no later."""
+
+    beside: int = 4
+    """Pixels on all sides that must rest as well for a leak [px]: a lens makes a pixel see them."""
+
+    inner: float = 0.5
+    """Rate of a leak where they do, relative to that of all, at least ..."""
+
+    inner_events: int = 20
+    """... if so many events are to be expected there."""
 
     spread: float = 0.5
     """Pixels that send, as a share of as many as have events if all send alike: hot pixels are few."""
@@ -142,6 +153,22 @@ class Rests:
     def seconds(self) -> float:
         """Time of all pixels together [s]."""
         return float((self.end - self.begin).sum())
+
+    def where_neighbours_rest(self, width: int, height: int, reach: int) -> Rests:
+        """Return the rests, as far as all pixels around rest as well.
+
+        Args:
+            width: Columns of the sensor.
+            height: Rows of the sensor.
+            reach: How far around, in rows and columns [px].
+        """
+        begin, end = np.full(width * height, np.inf), np.full(width * height, -np.inf)
+        begin[self.pixels], end[self.pixels] = self.begin, self.end
+        size = 2 * reach + 1
+        begin = maximum_filter(begin.reshape(height, width), size).reshape(-1)[self.pixels]
+        end = minimum_filter(end.reshape(height, width), size).reshape(-1)[self.pixels]
+        kept = begin < end
+        return Rests(self.pixels[kept], begin[kept], end[kept])
 
     def events_in(
         self, events: Events
@@ -333,6 +360,8 @@ def judge_events_at_rest(
     on = int(p[later].sum())
     if count < settings.events // 2 or count < settings.more * (model + 1) or count < settings.goes_on * many:
         return None
+    if not _goes_on_after_motion(t, at, rests, settings):
+        return None
     if not _sent_by_all(at, rests, settings):
         return None
     rarer, off = min(on, count - on) / count, 1 - on / count
@@ -349,6 +378,8 @@ def judge_events_at_rest(
             details[way] = share
             words += f"; {why}"
     elif off <= settings.one:
+        if not _goes_on_inside(rests, events, rate, settings):
+            return None
         name, words = LEAK_EVENTS, "all of them ON" if not off else f"{format_percent(1 - off)} of them ON"
     else:
         return None
@@ -360,6 +391,46 @@ def judge_events_at_rest(
         name=name, answer=Answer.FOUND, p=float(stats.poisson.sf(count - 1, model + 1)), size=rate,
         low=low, high=high, unit="events per second of a pixel at rest", sentence=sentence, details=details,
     )  # fmt: skip
+
+
+def _goes_on_after_motion(
+    t: Array, at: NDArray[np.int64], rests: Rests, settings: EventsAtRestSettings
+) -> bool:
+    """Whether events come long after light came to rest, too, as far as there are any.
+
+    The rests are compared that begin after motion: others begin with a new memory, which a leak moves slowly.
+
+    Args:
+        t: Of the events [s], shape (N,).
+        at: Which pixel sent each, shape (N,).
+        rests: Of the pixels.
+        settings: How many come later.
+    """
+    moved = rests.begin > rests.begin.min()
+    length = np.sort((rests.end - rests.begin)[moved])
+    since = (t - rests.begin[at])[moved[at]]
+    if len(since) < settings.events // 2:
+        return True
+    # time of all rests up to the length of each: all of the shorter ones, and as much of all others
+    before = np.cumsum(length) + length * np.arange(len(length) - 1, -1, -1)
+    half = np.interp(0.5 * before[-1], before, length)
+    return bool(np.count_nonzero(since > half) >= settings.goes_on * len(since))
+
+
+def _goes_on_inside(rests: Rests, events: Events, rate: float, settings: EventsAtRestSettings) -> bool:
+    """Whether pixels whose neighbours rest send as others do, as far as there are any.
+
+    Args:
+        rests: Of the pixels.
+        events: Of all pixels.
+        rate: Of a pixel at rest [Hz].
+        settings: How many they send.
+    """
+    inner = rests.where_neighbours_rest(events.width, events.height, settings.beside)
+    expected = inner.seconds * rate
+    if expected < settings.inner_events:
+        return True
+    return len(inner.events_in(events)[0]) >= settings.inner * expected
 
 
 def _way_of_noise(

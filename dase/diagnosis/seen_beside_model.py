@@ -158,7 +158,11 @@ def _look_at_thresholds(
     if MISMATCH not in task.given:
         found.append(find_unequal_thresholds(light, model.sensor, seed=task.seed))
     # light that goes on in a dead time counts for nothing, and the less the longer the time between events is
-    if LEAKING not in task.given and not (seen.entry_of(LEAK_EVENTS) or seen.entry_of(DEAD_TIME)):
+    # (noise of the voltage, with one threshold lower than the other, goes to that one meanwhile)
+    noise = seen.entry_of(NOISE_AT_REST)
+    returns = noise is not None and "returning" in noise.details
+    hidden = seen.entry_of(LEAK_EVENTS) or seen.entry_of(DEAD_TIME) or returns
+    if LEAKING not in task.given and not hidden:
         structure = task.evidence.structure
         found.append(find_drifting_memory(light, model.sensor, structure=structure, seed=task.seed))
     return replace(seen, entries=(*seen.entries, *(one for one in found if one is not None)))

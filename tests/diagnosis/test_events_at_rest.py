@@ -155,6 +155,59 @@ def test_events_of_all_pixels_at_once_are_a_lamp_and_no_noise():
     assert judge_events_at_rest(rests, events, 0) is None
 
 
+@pytest.mark.parametrize("goes_on", [False, True])
+def test_what_a_slow_pixel_sends_late_in_short_rests_is_no_leak(goes_on):
+    """Poles of 60 Hz that ring in the dark send ON events 0.1 s after motion, late in short rests."""
+    rng = np.random.default_rng(5)
+    pixels = np.arange(1000, dtype=np.int32)
+    begin = rng.uniform(0.1, 0.4, 1000)
+    rests = Rests(pixels, begin, np.where(pixels < 700, begin + 0.15, 1.0))
+    at = rng.integers(0, 1000, 3000)
+    since = rng.uniform(0, 1 if goes_on else 0.15, 3000)
+    inside = since < (rests.end - rests.begin)[at]
+    t, at = (begin[at] + since)[inside], at[inside]
+    order = np.argsort(t)
+    t, at = t[order], at[order]
+    events = Events(t, at % 50, at // 50, np.ones(len(t), bool), 50, 20)
+    later = rests.events_in(events)[3]
+    assert later.mean() > AT_REST.goes_on
+    assert (judge_events_at_rest(rests, events, 0) is not None) is goes_on
+
+
+@pytest.mark.parametrize("everywhere", [False, True])
+def test_what_pixels_beside_moving_ones_send_is_no_leak(everywhere):
+    """A lens that is less sharp than the scene shows them their neighbours, up to two pixels away."""
+    rng = np.random.default_rng(6)
+    pixels = np.arange(2000, dtype=np.int32)
+    still = pixels[(pixels % 50) % 25 > 4]  # strips of five columns move
+    rests = Rests(still, np.zeros(len(still)), np.ones(len(still)))
+    beside = np.isin((still % 50) % 25, (5, 6, 23, 24))
+    senders = still if everywhere else still[beside]
+    at = rng.choice(senders, 3000)
+    events = Events(np.sort(rng.uniform(0, 1, 3000)), at % 50, at // 50, np.ones(3000, bool), 50, 40)
+    settings = replace(AT_REST, spread=0.1)
+    entry = judge_events_at_rest(rests, events, 0, settings=settings)
+    assert (entry is not None) is everywhere
+
+
+@pytest.mark.parametrize(("way", "asked"), [("returning", False), ("independent", True), ("", True)])
+def test_no_leak_is_read_off_the_light_beside_noise_that_returns(monkeypatch, way, asked):
+    """Between unequal thresholds it goes to the lower one, the longer the more: as a memory that drifts."""
+    noise = Signature(
+        name=NOISE_AT_REST, answer=Answer.FOUND, sentence="seen", details={way: 0.9} if way else {}
+    )
+    drifts = Signature(name=LEAK_EVENTS, answer=Answer.FOUND, sentence="drifts")
+    monkeypatch.setattr(seen_beside_model.LightBetweenEvents, "of", lambda *args, **more: object())
+    monkeypatch.setattr(seen_beside_model, "find_unequal_thresholds", lambda *args, **more: None)
+    monkeypatch.setattr(seen_beside_model, "find_drifting_memory", lambda *args, **more: drifts)
+    task = SimpleNamespace(
+        evidence=SimpleNamespace(contradiction="", structure=None), given=frozenset(), seed=0
+    )
+    model = SimpleNamespace(sensor=Sensor())
+    seen = seen_beside_model._look_at_thresholds(task, SeenEffects((noise,)), None, model)
+    assert (seen.entry_of(LEAK_EVENTS) is not None) is asked
+
+
 def test_noise_that_is_drawn_for_some_frames_more_than_for_others_is_told_by_its_polarities():
     events, rests = at_random(2000, 0.5, together=True)
     assert judge_events_at_rest(rests, events, 0, frame_gap=1e-4).name == NOISE_AT_REST
