@@ -2,7 +2,8 @@
 
 Where a simulator holds the frames of a clip, light jumps, and a pixel sends as many events within
 microseconds as the jump has thresholds. But after the first of them each needs a whole threshold more. So
-where no jump was half as large, what a pixel sends twice within microseconds is sent twice.
+where no jump was half as large, what a pixel sends twice within microseconds is sent twice. So it is with the
+light of any clip from frame to frame: behind a latency nothing tells that frames were held.
 """
 
 from __future__ import annotations
@@ -50,7 +51,7 @@ def find_doubles_at_small_jumps(
 
     Args:
         events: Of the scene.
-        scene: Light that jumps at times of its samples.
+        scene: Light of which a step from sample to sample counts as a jump.
         sensor: Its thresholds tell which jumps are small.
         settings: Where light makes no two events.
     """
@@ -68,7 +69,7 @@ def are_at_small_jumps(
 
     Args:
         events: Of the scene, N of them; outside its time none is chosen.
-        scene: Light that jumps at times of its samples.
+        scene: Light of which a step from sample to sample counts as a jump.
         sensor: Its thresholds tell which jumps are small.
         settings: Where light makes no two events.
     """

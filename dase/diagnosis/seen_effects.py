@@ -26,6 +26,7 @@ from dase.fitting.measurement import Measurement
 from dase.results import DetectionLimit, Diagnosis, Finding, Grade
 from dase.scenes.between_frames import CameraScene
 from dase.scenes.scene import Scene
+from dase.scenes.video import VideoScene
 from dase.signatures.burst_times import BurstTimes
 from dase.signatures.find import find_signatures
 from dase.signatures.flicker import FlickerSettings
@@ -323,8 +324,11 @@ def without_the_scene(seen: SeenEffects, measurement: Measurement, sensor: Senso
         seen = replace(
             seen, entries=tuple(one for one in seen.entries if _is_at_rest(one, measurement, scene))
         )
-    if is_held(scene):
-        seen = _with_doubles(seen, find_doubles_at_small_jumps(measurement.compared_events(), scene, sensor))
+    if is_held(scene) or (isinstance(scene, VideoScene) and seen.entry_of(DOUBLE_EVENTS) is not None):
+        doubles = find_doubles_at_small_jumps(measurement.compared_events(), scene, sensor)
+        # a simulator that is late does not show that it has held a clip
+        if is_held(scene) or doubles.answer is Answer.NOT_SEEN:
+            seen = _with_doubles(seen, doubles)
     asked = _asked_of_scene(seen.entries, scene)
     if not asked:
         return seen

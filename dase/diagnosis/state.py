@@ -133,6 +133,7 @@ class DiagnosisState:
             was searched before says nothing then.
         evaluations_before: Simulations that were run before the measurement was split anew.
         samples_before: Pixels times samples of those.
+        doubles: Whether double events are seen, and tried.
     """
 
     task: DiagnosisTask
@@ -143,6 +144,7 @@ class DiagnosisState:
     other_scene: Measurement | None = None
     evaluations_before: int = 0
     samples_before: int = 0
+    doubles: bool = False
 
     @property
     def evaluations(self) -> int:
@@ -160,13 +162,15 @@ class DiagnosisState:
 
     def try_doubles(self) -> None:
         """Let double events be tried: they are seen, and not of the scene."""
+        self.doubles = True
         self.task = replace(self.task, evidence=replace(self.task.evidence, doubles=True))
 
     def split_anew(self, evidence: SplitMeasurement) -> None:
         """Go on with a split of which all of the time is fitted; what was run before counts on."""
         self.evaluations_before, self.samples_before = self.evaluations, self.samples
-        evidence = replace(evidence, doubles=self.task.evidence.doubles)
         self.task = replace(self.task, evidence=evidence, all_time=True)
+        if self.doubles:
+            self.try_doubles()
 
     def count_as_given(self, name: str) -> None:
         """Count an effect as one that a model has before the search."""

@@ -25,7 +25,12 @@ def clip() -> VideoScene:
     steps = 0.05 * rng.choice([-1, 1], (FRAMES, SIZE, SIZE))
     level = np.clip(np.log(0.3) + np.cumsum(steps, 0), np.log(0.1), 0)
     level[:, :, SIZE // 2 :] = np.log(0.3) + 0.35 * (-1.0) ** np.arange(FRAMES)[:, None, None]
-    return VideoScene(np.exp(level).astype(np.float32), GAP * np.arange(FRAMES)).held(1e-3)
+    return VideoScene(np.exp(level).astype(np.float32), GAP * np.arange(FRAMES))
+
+
+@pytest.fixture(scope="module")
+def held(clip) -> VideoScene:
+    return clip.held(1e-3)
 
 
 def made(share: float, longest: float = 2e-5) -> Events:
@@ -49,18 +54,19 @@ def made(share: float, longest: float = 2e-5) -> Events:
     )
 
 
+@pytest.mark.parametrize("scene", ["clip", "held"])
 @pytest.mark.parametrize(("share", "there"), [(0.0, False), (0.05, True)])
-def test_events_of_a_jump_are_not_double_and_those_of_slow_light_are(clip, share, there):
-    measurement = Measurement(made(share), clip)
+def test_events_of_a_jump_are_not_double_and_those_of_slow_light_are(request, scene, share, there):
+    measurement = Measurement(made(share), request.getfixturevalue(scene))
     seen = find_seen_effects(measurement, EFFECTS)
     assert seen.entry_of(DOUBLE_EVENTS) is not None  # without the light nobody can tell
     kept = without_the_scene(seen, measurement, SENSOR, 1).entry_of(DOUBLE_EVENTS)
     assert (kept is not None) == there
 
 
-def test_double_events_are_seen_that_jumps_hide(clip):
+def test_double_events_are_seen_that_jumps_hide(held):
     """Those of jumps follow each other as fast, whether they are sent twice or not."""
-    measurement = Measurement(made(0.05, longest=3e-4), clip)
+    measurement = Measurement(made(0.05, longest=3e-4), held)
     seen = find_seen_effects(measurement, EFFECTS)
     assert seen.entry_of(DOUBLE_EVENTS) is None
     left = without_the_scene(seen, measurement, SENSOR, 1)
@@ -69,11 +75,11 @@ def test_double_events_are_seen_that_jumps_hide(clip):
 
 
 @pytest.mark.parametrize("block", [4_000_000, 5000])
-def test_jumps_are_small_in_the_time_before(clip, block):
+def test_jumps_are_small_in_the_time_before(held, block):
     t = np.concatenate([np.linspace(0.03, 0.7, 50), [-0.1, 0.9]])
     x = np.where(np.arange(52) % 2 == 0, 3, 30).astype(np.uint16)
     events = Events(np.sort(t), x, np.full(52, 7, np.uint16), np.ones(52, bool), SIZE, SIZE)
-    small = are_at_small_jumps(events, clip, SENSOR, JumpSettings(block=block))
+    small = are_at_small_jumps(events, held, SENSOR, JumpSettings(block=block))
     assert np.array_equal(small, (x == 3) & (events.t > 0) & (events.t < 0.79))
     # a jump counts for as long as a pixel may be late, and no longer
     once = np.full((FRAMES, 1, 2), 0.3, np.float32)
