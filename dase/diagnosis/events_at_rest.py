@@ -407,7 +407,7 @@ def _goes_on_after_motion(
         settings: How many come later.
     """
     moved = rests.begin > rests.begin.min()
-    length = np.sort((rests.end - rests.begin)[moved])
+    length = np.append(0.0, np.sort((rests.end - rests.begin)[moved]))
     since = (t - rests.begin[at])[moved[at]]
     if len(since) < settings.events // 2:
         return True

@@ -96,7 +96,7 @@ class RepeatedFrames:
         return len(self._index)
 
     def of(self, changed: Callable[[Frames], Frames]) -> RepeatedFrames:
-        """Return the same frames, each changed once however often it is there."""
+        """Return the same frames, each of shape (height, width) changed once however often it is there."""
         return RepeatedFrames(changed(self._frames), self._index)
 
     def __getitem__(self, index: NDArray[np.int64]) -> NDArray[Any]:
