@@ -99,7 +99,11 @@ def fit_added(
 
 
 def _as_lens_before_clip(effect: SceneEffect, measurement: Measurement) -> OpticsBlur:
-    """Return what acts on pictures as the lens before a clip that it has to be to be fitted."""
+    """Return what acts on pictures as the lens before a clip that it has to be to be fitted.
+
+    Raises:
+        InputError: It is another effect, or the scene is no clip, or one behind a lens already.
+    """
     if not isinstance(effect, OpticsBlur):
         raise InputError(f"{effect.name} acts on pictures, and cannot be fitted: add it without a recording")
     if not isinstance(measurement.scene, VideoScene) or measurement.scene.sharp is not None:

@@ -157,6 +157,9 @@ def with_blurred_lens(
         EFFECT, grade, unknown=unknown, error_without=without.error, error_with=last.error, parameters=mine
     )
     out = replace(diagnosis, before=given.error)
+    if grade is not Grade.SUPPORTED:
+        note = f"all errors are behind a lens of {lens.sigma:.2g} px, which is not found for certain"
+        out = replace(out, notes=(*out.notes, note))
     if grade is Grade.STAND_IN:
         return replace(out, stand_ins=(*out.stand_ins, found))
     out = replace(out, findings=(*out.findings, found))

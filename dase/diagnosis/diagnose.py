@@ -139,8 +139,9 @@ def diagnose(
     found = _with_what_pixels_show(found, state.task, compared, seen, model, strength)
     if measurement.lens is not None:
         found = with_blurred_lens(found, state.task, compared, start, model)
-    found = replace(found, sensor=with_lens(found.sensor, lens), seconds=time.perf_counter() - begin)
-    return measurement.noted(found)
+    else:  # one that was given and is off is no lens that was found
+        found = replace(found, sensor=with_lens(found.sensor, lens))
+    return measurement.noted(replace(found, seconds=time.perf_counter() - begin))
 
 
 def _begin_search(

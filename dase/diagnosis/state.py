@@ -129,8 +129,8 @@ class DiagnosisState:
         path: How the search came to its last model; the one to go back to where another is tried.
         notes: What the user should know of the search.
         after_step: Told the model and the errors so far after each step.
-        other_scene: The measurement with its clip known at its frames alone, which explains it better: what
-            was searched before says nothing then.
+        other_scene: The measurement with its clip known at its frames alone, or behind a lens, which explains
+            it better: what was searched before says nothing then.
         evaluations_before: Simulations that were run before the measurement was split anew.
         samples_before: Pixels times samples of those.
         doubles: Whether double events are seen, and tried.

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from dase.events import Events
 from dase.probes.timestamp_patterns import PATTERNS, TimestampStructure
+from dase.signatures.calm_events import row_major_pixels
 
 
 @dataclass(frozen=True)
@@ -63,8 +64,7 @@ def share_stamped_again(events: Events) -> float:
     if not len(events):
         return 0.0
     stamp = np.concatenate([[0], np.cumsum(np.diff(events.t) > 0)])
-    pixel = events.y.astype(np.int64) * events.width + events.x
-    return 1 - len(np.unique(stamp * (events.width * events.height) + pixel)) / len(events)
+    return 1 - len(np.unique(stamp * (events.width * events.height) + row_major_pixels(events))) / len(events)
 
 
 def highest_event_rate(events: Events, span: float) -> float:

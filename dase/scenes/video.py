@@ -194,6 +194,7 @@ class VideoScene(Scene):
             raise InputError("video: frame times must be finite and increase")
         if isinstance(self._frames, np.ndarray):
             check_light(self._frames, "video")
+        self._lens_weights = np.ones(1, np.float32)
         self._light_of_level: NDArray[np.float32] | None = None
         if getattr(self._frames, "dtype", None) == np.uint8:
             self._light_of_level = to_light(np.arange(LEVELS, dtype=np.uint8), gamma=self.gamma)
@@ -208,6 +209,7 @@ class VideoScene(Scene):
         """Return the light as a simulator takes it that knows the frames alone."""
         other = copy(self)
         other.by_frames = True
+        other.sharp = self.sharp and self.sharp.known_at_frames()
         return other
 
     def longest_gap(self) -> float:
@@ -222,6 +224,8 @@ class VideoScene(Scene):
         Args:
             step: Length of the parts, about [s]; there are two of each frame at least.
         """
+        if self.sharp is not None:
+            return self.sharp.held(step).blurred(self._lens_weights)
         gaps = np.diff(self._times)
         parts = max(2, round(float(np.median(gaps)) / step)) if len(gaps) else 1
         inner = self._times[:-1, None] + gaps[:, None] * (np.arange(parts) + 1) / parts
@@ -244,7 +248,8 @@ class VideoScene(Scene):
         else:
             frames = BlurredFrames(self._frames, self.gamma, weights)
         out = VideoScene(frames, self._times)
-        out.held_for, out.by_frames, out.sharp = self.held_for, self.by_frames, self
+        out.held_for, out.by_frames = self.held_for, self.by_frames
+        out.sharp, out._lens_weights = self, weights
         return out
 
     def source(self, times: NDArray[np.float64], pixels: NDArray[np.int32], device: Any) -> tuple[str, Any]:

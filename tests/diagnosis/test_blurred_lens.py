@@ -11,7 +11,7 @@ from helpers.frame_simulator import shaken_texture
 import dase
 from dase.effects import EFFECTS
 from dase.effects.bandwidth import Bandwidth
-from dase.effects.optics_blur import OpticsBlur
+from dase.effects.optics_blur import OpticsBlur, blur_weights
 from dase.events import Events
 from dase.fitting.measurement import Measurement
 from dase.scenes.video import VideoScene
@@ -97,3 +97,29 @@ def test_frames_that_are_held_are_each_blurred_once(scene):
     np.testing.assert_allclose(seen.scene.frames(times), want, atol=1e-5)
     # seen through it once more it stays as it is
     assert seen.through_lens_of(dase.Sensor((behind, dase.EFFECTS["threshold"]()))).scene is seen.scene
+
+
+def test_a_clip_behind_a_lens_stays_there_however_its_frames_are_taken(scene):
+    """A diagnosis behind a lens may still find that frames were held, or filtered one by one."""
+    weights = blur_weights(SIGMA)
+    blurred = scene.blurred(weights)
+    held, want = blurred.held(1e-3), scene.held(1e-3).blurred(weights)
+    times = want.sample_times()[[0, 7, 8]]
+    np.testing.assert_array_equal(held.frames(times), want.frames(times))
+    assert held.held_for == scene.longest_gap()
+    assert held.sharp.held_for == scene.longest_gap()
+    by_frames = blurred.known_at_frames()
+    assert by_frames.by_frames
+    assert by_frames.sharp.by_frames
+    assert not scene.by_frames
+
+
+@pytest.mark.slow
+def test_a_lens_that_was_given_and_is_off_does_not_hide_the_one_that_is_found(scene):
+    off = dase.Sensor((OpticsBlur.identity(), dase.EFFECTS["threshold"](on=0.2, off=0.22)))
+    lens = {"optics_blur": EFFECTS["optics_blur"]}
+    found = dase.diagnose(
+        behind_lens(scene, SIGMA), off, scene=scene, effects=lens, most=1, pixels=PIXELS, settings=NO_LIMITS
+    )
+    assert found.selected == ("optics_blur",)
+    assert found.sensor["optics_blur"].sigma == pytest.approx(SIGMA, rel=0.06)
