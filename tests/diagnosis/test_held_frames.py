@@ -12,6 +12,7 @@ from dase.diagnosis.held_frames import fewest_frames
 from dase.effects import EFFECTS
 from dase.events import Events
 from dase.fitting.measurement import as_measurement
+from dase.results import Grade
 from dase.scenes.video import VideoScene
 
 GAP = 4e-3
@@ -143,10 +144,12 @@ def test_a_slow_low_pass_hides_no_held_frame(scene):
     assert not as_measurement(events, scene).held
     tried = {name: EFFECTS[name] for name in ("bandwidth", "latency", "mismatch")}
     found = dase.diagnose(events, "ideal", scene=scene, effects=tried, most=1, pixels=250, settings=NO_LIMITS)
-    # the jump takes a millisecond in the model, which leaves a little
-    assert found.selected == ("bandwidth",)
-    assert found.errors[-1] < 0.7
-    assert found.parameters["bandwidth.cutoff"].value == pytest.approx(60, rel=0.05)
+    (one,) = found.findings
+    assert one.effect == "bandwidth"
+    # a jump takes a millisecond in the model: what that leaves is about what chance may, and the grade open
+    assert one.grade in (Grade.SUPPORTED, Grade.EITHER)
+    assert one.error_with < 0.1 * one.error_without
+    assert one.parameters["bandwidth.cutoff"].value == pytest.approx(60, rel=0.05)
     assert any("held" in note for note in found.notes)
 
 

@@ -8,8 +8,6 @@ from pathlib import Path
 import cv2
 import pytest
 
-import dase
-
 EXAMPLES = Path(__file__).parents[2] / "examples"
 
 
@@ -25,17 +23,6 @@ def run(tmp_path, monkeypatch, capsys):
         return found, out
 
     return run
-
-
-@pytest.fixture
-def fewer_steps(monkeypatch):
-    """Return what has a training end sooner, its learning rate laid out for as many steps."""
-
-    def fewer_steps(name, steps):
-        settings = getattr(dase.tasks, name)
-        monkeypatch.setattr(dase.tasks, name, lambda **given: settings(**given | {"steps": steps}))
-
-    return fewer_steps
 
 
 def test_a_video(run):
@@ -65,9 +52,8 @@ def test_an_effect_of_ones_own(run):
 
 
 @pytest.mark.slow
-def test_a_network_for_reconstruction(run, fewer_steps):
+def test_a_network_for_reconstruction(run):
     pytest.importorskip("torch")
-    fewer_steps("ReconstructionTraining", 120)
     found, out = run("train_reconstruction.py")
     assert found["fitted"].sensor["threshold"].on == pytest.approx(0.3, rel=0.1)
     assert "recording.h5: reconstruction, 74 judged" in out
