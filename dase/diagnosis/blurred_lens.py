@@ -1,8 +1,10 @@
 """Whether the camera saw a clip less sharply than it is: a lens, which no fit of what pixels do can find.
 
-A lens acts on pictures, so each width of it is another scene. It is asked for where a search ends with
-something unexplained: one number is tried against all that was added. Where it leaves less, the search begins
-anew behind that lens. A camera's own frames are as blurred as its events, and are not asked.
+A lens acts on pictures, so each width of it is another scene. How far light goes from one event of a pixel
+to the next is the threshold, and differs least behind the lens that was there: where that shows it, the
+search begins behind it. It is asked for once more where a search ends with something unexplained: one number
+is tried against all that was added, and where it leaves less, the search begins anew. A camera's own frames
+are as blurred as its events, and are not asked.
 """
 
 from __future__ import annotations
@@ -11,13 +13,17 @@ import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from dase.diagnosis.compared_measurement import ComparedMeasurement
 from dase.diagnosis.grading import grade_of, judge_on_report
+from dase.diagnosis.light_between_events import LightBetweenEvents, LightSteps
 from dase.diagnosis.state import DiagnosisTask
 from dase.effects.optics_blur import OpticsBlur
 from dase.fitting.data_split import SplitMeasurement
 from dase.fitting.measurement import Measurement, with_lens
 from dase.fitting.model import FittedModel, fit_present_model, model_of, refit_model
+from dase.formatting import format_percent
 from dase.probes.random_streams import SimulationStream
 from dase.results import Diagnosis, Estimate, Finding, Grade
 from dase.scenes.scene import Scene
@@ -52,8 +58,138 @@ class LensSettings:
     repeats: int = 12
     """Simulations that judge."""
 
+    octaves: tuple[float, float, float] = (-2.0, 1.5, 0.5)
+    """Widths behind which steps from event to event are compared: from, to, and apart [octaves of 1.2 px]."""
+
+    first: tuple[float, float] = (-1.5, -0.5)
+    """Those that are looked at first [octaves of 1.2 px]."""
+
+    begun: float = 0.97
+    """Share of what steps differ by that they do behind the better of these, at most, for others to be looked
+    at: narrower than a lens they show some of it, and without one steps differ more."""
+
+    closer: float = 0.125
+    """And between the two beside the best, so far apart [octaves]."""
+
+    alike: float = 0.6
+    """Share of what steps differ by that they do behind a lens, at most, in either polarity: 0.02 to 0.5
+    where there was one. Without one, and with what follows, it was 0.75 at least."""
+
+    even: float = 0.35
+    """What they then differ by, at most, relative to the threshold: of slow pixels, whose steps a lens makes
+    more alike, too, it was 0.7 and more."""
+
+    steps: int = 300
+    """Steps of a polarity, at least."""
+
+    longest: float = 0.05
+    """Time of one that counts, at most [s]: noise and leaks grow with time."""
+
 
 LENS = LensSettings()
+
+
+@dataclass(frozen=True)
+class SeenLens:
+    """A lens that is seen by how far light goes from event to event.
+
+    Args:
+        measurement: Its clip is behind the lens.
+        sharp: What steps differ by without the lens, relative to the threshold.
+        behind: What they differ by behind it.
+    """
+
+    measurement: Measurement
+    sharp: float
+    behind: float
+
+    @property
+    def sentence(self) -> str:
+        """What is seen."""
+        return (
+            f"from one event of a pixel to the next the light of the clip goes as far to within "
+            f"{format_percent(self.sharp)}, and behind the lens to within {format_percent(self.behind)}"
+        )
+
+
+def lens_between_events(
+    measurement: Measurement, *, log_eps: float, settings: LensSettings = LENS
+) -> SeenLens | None:
+    """Return the lens behind which light goes equally far from event to event; None where none is seen.
+
+    It takes no model: whatever thresholds are, light goes one of them from each event to the next. Effects
+    that make steps differ, such as a low-pass, hide a lens here, and are no lens.
+
+    Args:
+        measurement: Of a clip, without a lens.
+        log_eps: Added to intensities before the logarithm.
+        settings: Which widths are looked at, and how alike steps must become.
+    """
+    scene = measurement.scene
+    if not isinstance(scene, VideoScene) or scene.sharp is not None or scene.held_for:
+        return None
+
+    def differ(width: float) -> tuple[float, float]:
+        seen = behind_lens(measurement, width) if width else measurement
+        light = LightBetweenEvents.of(seen, log_eps=log_eps)
+        return (math.nan, math.nan) if light is None else _differences(light.seen, settings)
+
+    sharp = differ(0.0)
+    if not all(math.isfinite(one) for one in sharp):
+        return None
+    low, high, step = settings.octaves
+    seen = {at: differ(1.2 * 2**at) for at in settings.first}
+    if not any(_ratio(sharp, one) < settings.begun for one in seen.values()):
+        return None
+    wide = np.arange(low, high + step / 2, step)
+    seen |= {float(at): differ(1.2 * 2**at) for at in wide if float(at) not in seen}
+    best = min(seen, key=lambda at: max(seen[at]))
+    if not low < best < high or not _is_lens(sharp, seen[best], settings):
+        return None
+    closer = np.arange(best - step + settings.closer, best + step - settings.closer / 2, settings.closer)
+    seen |= {float(at): differ(1.2 * 2**at) for at in closer if float(at) not in seen}
+    best = min(seen, key=lambda at: max(seen[at]))
+    errors = tuple(max(seen[at]) ** 2 for at in (best - settings.closer, best, best + settings.closer))
+    assert len(errors) == 3
+    width = _least_between(1.2 * 2**best, settings.closer, errors)
+    return SeenLens(behind_lens(measurement, width), max(sharp), max(seen[best]))
+
+
+def _is_lens(sharp: tuple[float, float], behind: tuple[float, float], settings: LensSettings = LENS) -> bool:
+    """Return whether steps differ so much less behind a lens, and so little.
+
+    Args:
+        sharp: What ON and OFF steps differ by without it, relative to the threshold.
+        behind: The same behind it.
+        settings: How much less, and how little.
+    """
+    return _ratio(sharp, behind) <= settings.alike and max(behind) <= settings.even
+
+
+def _ratio(sharp: tuple[float, float], behind: tuple[float, float]) -> float:
+    """Return what steps differ by behind a lens, relative to without it, of the polarity with more."""
+    return max(b / a if a > 0 else math.inf for a, b in zip(sharp, behind, strict=True))
+
+
+def _differences(steps: LightSteps, settings: LensSettings = LENS) -> tuple[float, float]:
+    """Return what ON and OFF steps differ by: half of what two thirds lie in, relative to their median.
+
+    NaN for a polarity with too few.
+
+    Args:
+        steps: From event to event.
+        settings: Which count.
+    """
+    out = []
+    for on in (True, False):
+        moved = steps.change[steps.counts & (steps.on == on) & (steps.gap < settings.longest)]
+        if len(moved) < settings.steps:
+            out.append(math.nan)
+            continue
+        low, middle, high = np.quantile(moved, [0.16, 0.5, 0.84])
+        as_far = float(middle) if on else -float(middle)
+        out.append(0.5 * float(high - low) / as_far if as_far > 0 else math.nan)
+    return out[0], out[1]
 
 
 def seen_through_a_lens(
@@ -151,13 +287,18 @@ def with_blurred_lens(
     )
     last = judge_on_report(task, [model], repeats=repeats)[0].judgement
     grade, unknown = grade_of(first, without, last, math.inf, has_rivals=False, settings=task.settings.grades)
+    bare = replace(measurement, scene=scene.sharp, lens=None)
+    seen = lens_between_events(bare, log_eps=compared.given.log_eps, settings=settings)
+    if seen is not None and without.error > last.error:
+        grade, unknown = Grade.CERTAIN, False
     width = _width_beside(compared, task, model, lens.sigma, settings)
     mine = {f"{EFFECT}.sigma": width}
     found = Finding(
-        EFFECT, grade, unknown=unknown, error_without=without.error, error_with=last.error, parameters=mine
-    )
+        EFFECT, grade, unknown=unknown, error_without=without.error, error_with=last.error, parameters=mine,
+        seen="" if seen is None else seen.sentence,
+    )  # fmt: skip
     out = replace(diagnosis, before=given.error)
-    if grade is not Grade.SUPPORTED:
+    if grade not in (Grade.CERTAIN, Grade.SUPPORTED):
         note = f"all errors are behind a lens of {lens.sigma:.2g} px, which is not found for certain"
         out = replace(out, notes=(*out.notes, note))
     if grade is Grade.STAND_IN:

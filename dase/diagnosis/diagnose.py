@@ -8,7 +8,8 @@ from dataclasses import replace
 from functools import partial
 from os import PathLike
 
-from dase.diagnosis.blurred_lens import with_blurred_lens
+from dase.diagnosis.blurred_lens import EFFECT as LENS
+from dase.diagnosis.blurred_lens import lens_between_events, with_blurred_lens
 from dase.diagnosis.compared_measurement import ComparedMeasurement, choose_compared
 from dase.diagnosis.conclusion import conclude_diagnosis, known_so_far
 from dase.diagnosis.dead_time import EFFECT as REFRACTORY
@@ -20,6 +21,7 @@ from dase.diagnosis.held_frames import (
     with_frame_as_memory,
     with_longer_dead_time,
 )
+from dase.diagnosis.mostly_bursts import bursts_of_all_events, with_bursts_of_all_events
 from dase.diagnosis.seen_beside_model import look_beside_model, settle_dead_time, settle_jitter
 from dase.diagnosis.seen_effects import (
     SeenEffects,
@@ -105,9 +107,18 @@ def diagnose(
     lens = lens_of(given)
     given = given.without(OpticsBlur.name).bound_to(measurement.scene)
     tell("looking at the events alone", 0.0, float("nan"))
+    if most > 0 and LENS in effects:
+        behind = lens_between_events(measurement, log_eps=given.log_eps)
+        measurement = measurement if behind is None else behind.measurement
     compared = choose_compared(
         measurement, given, effects, pixels=pixels, seed=seed, device=device, settings=settings
     )
+    bursts = bursts_of_all_events(compared, effects)
+    if bursts is not None:
+        found = again(measurement, sensor=given.with_effect(bursts.effect))
+        found = with_bursts_of_all_events(found, compared, bursts)
+        found = replace(found, sensor=with_lens(found.sensor, None if measurement.lens else lens))
+        return replace(found, seconds=time.perf_counter() - begin)
     state, given, free = _begin_search(compared, effects, free, tell, settings)
     names = state.task.given
     before, start = _error_as_given(state.task, given, free), _fitted_unless_worse(state, given, free)

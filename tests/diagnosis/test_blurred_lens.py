@@ -9,11 +9,13 @@ from helpers.brief_diagnosis import NO_LIMITS
 from helpers.frame_simulator import shaken_texture
 
 import dase
+from dase.diagnosis.blurred_lens import lens_between_events
 from dase.effects import EFFECTS
 from dase.effects.bandwidth import Bandwidth
 from dase.effects.optics_blur import OpticsBlur, blur_weights
 from dase.events import Events
-from dase.fitting.measurement import Measurement
+from dase.fitting.measurement import Measurement, as_measurement
+from dase.results import Grade
 from dase.scenes.video import VideoScene
 
 SIGMA = 1.3
@@ -58,6 +60,48 @@ def test_a_lens_is_found_beside_a_leak(scene):
     assert found.unexplained is None
     # what it wrote is what the clip is compared with
     assert dase.compare(events, found.sensor, scene=scene, pixels=PIXELS).error < 1
+
+
+@pytest.mark.parametrize("beside", ["", "dark", "jitter", "shot"])
+def test_a_lens_is_seen_by_how_far_light_goes_from_event_to_event(scene, beside):
+    more = {"dark": EFFECTS["dark"](current=0.03), "jitter": EFFECTS["jitter"](spread=0.1),
+            "shot": EFFECTS["shot"](rate=5.0)}  # fmt: skip
+    events = behind_lens(scene, SIGMA, *([more[beside]] if beside else []))
+    seen = lens_between_events(as_measurement(events, scene), log_eps=1e-3)
+    assert seen.measurement.lens.sigma == pytest.approx(SIGMA, rel=0.05)
+    assert seen.behind < 0.5 * seen.sharp
+    # seen through it already
+    assert lens_between_events(seen.measurement, log_eps=1e-3) is None
+
+
+@pytest.mark.parametrize(
+    "effect",
+    [
+        EFFECTS["jitter"](spread=0.3), EFFECTS["mismatch"](spread=0.3), EFFECTS["bandwidth"](cutoff=30.0),
+        EFFECTS["second_order"](cutoff=60.0), EFFECTS["latency"](delay=5e-3), EFFECTS["linlog"](knee=0.2),
+        EFFECTS["refractory"](period=0.01), EFFECTS["vignetting"](loss=0.8), EFFECTS["shot"](rate=20.0),
+    ],
+    ids=lambda effect: effect.name,
+)  # fmt: skip
+def test_what_makes_steps_differ_is_no_lens(scene, effect):
+    sensor = dase.Sensor((effect, EFFECTS["threshold"](on=0.2, off=0.22)))
+    events = dase.simulate(scene, sensor, seed=1)
+    assert lens_between_events(as_measurement(events, scene), log_eps=1e-3) is None
+
+
+@pytest.mark.slow
+def test_a_lens_and_a_dark_current_are_told_apart(scene):
+    """Neither leaves little by itself, and light that is too sharp looks like a jitter."""
+    events = behind_lens(scene, SIGMA, EFFECTS["dark"](current=0.05))
+    tried = TRIED | {"dark": EFFECTS["dark"]}
+    found = dase.diagnose(
+        events, "ideal", scene=scene, effects=tried, most=2, pixels=PIXELS, settings=NO_LIMITS
+    )
+    assert {one.effect: one.grade for one in found.findings} == {
+        "optics_blur": Grade.CERTAIN, "dark": Grade.SUPPORTED,
+    }  # fmt: skip
+    assert found.parameters["optics_blur.sigma"].value == pytest.approx(SIGMA, rel=0.06)
+    assert found.parameters["dark.current"].value == pytest.approx(0.05, rel=0.1)
 
 
 @pytest.mark.slow
