@@ -128,6 +128,8 @@ def lens_between_events(
     scene = measurement.scene
     if not isinstance(scene, VideoScene) or scene.sharp is not None or scene.held_for:
         return None
+    if (scene.width, scene.height) != (measurement.events.width, measurement.events.height):
+        return None  # who splits the measurement says so
 
     def differ(width: float) -> tuple[float, float]:
         seen = behind_lens(measurement, width) if width else measurement

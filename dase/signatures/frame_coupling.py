@@ -33,6 +33,8 @@ class CouplingSettings:
     fewest_events: float = 50.0  # per frame interval and polarity
     usual: float = 0.02  # [s] its median is the usual rate: longer than a burst, shorter than a scene
     shortest: float = 0.014  # [s] what repeats sooner is a lamp: it has 100 or 120 cycles per second
+    windows: tuple[float, ...] = (0.03, 0.06, 0.12)  # of a period, in which bursts in step with frames come
+    periods: int = 24  # that lie between most pairs of bursts are tried
     margin: float = 0.003  # [s] left out on both sides of a burst
     most_margin: float = 0.1  # share of the interval, so that short ones keep time between their bursts
     tiles: float = 0.4  # share of the active tiles that take part in a burst of the whole array
@@ -161,29 +163,67 @@ def _find_bursts(counts: NDArray[np.uint32], step: float, s: CouplingSettings) -
     return out
 
 
-def _find_period(times: NDArray[np.float64]) -> tuple[float, float]:
+def _find_period(times: NDArray[np.float64], step: float, s: CouplingSettings) -> tuple[float, float]:
     """Return the period of bursts [s] and the chance of one as good.
 
-    Phases of n bursts at a period that was not looked for have a Rayleigh statistic above R with a chance of
-    exp(-R). Periods are looked for: not more of them than there are pairs of bursts.
+    Of n bursts without a period, at least k come within a window of w turns of one of them with a chance of
+    at most n times that of k - 1 of the n - 1 others doing so. Periods are looked for: no more of them than
+    there are pairs of bursts, as finely as windows are wide, and for a few windows.
+
+    Args:
+        times: Of the bursts, ascending [s], shape (n,).
+        step: Of the clock that tells them [s].
+        s: Which periods and windows are tried.
     """
     count = len(times)
-    median = float(np.median(np.diff(times)))
+    apart = (times[None] - times[:, None])[np.triu_indices(count, 1)]
+    apart = apart[(apart >= 2 * step) & (apart <= (times[-1] - times[0]) / (s.fewest_frames - 1) + step)]
+    near = np.bincount(np.round(apart / step).astype(np.int64)) if len(apart) else np.zeros(1)
+    often = np.argsort(near + np.roll(near, 1) + np.roll(near, -1))[::-1][: s.periods]
+    best = (float(np.median(np.diff(times))), 1.0)
+    for about in (best[0], *(step * float(one) for one in often if near[one])):
+        period, p = _refine_period(times, about, step, s)
+        if p < best[1]:
+            best = period, p
+    return best[0], min(1.0, 0.5 * count**2 * best[1])
+
+
+def _refine_period(
+    times: NDArray[np.float64], about: float, step: float, s: CouplingSettings
+) -> tuple[float, float]:
+    """Return the period near one by which most bursts keep step [s], and the chance of as many at one period.
+
+    Args:
+        times: Of the bursts, ascending [s], shape (n,).
+        about: The period, to a step of the clock [s].
+        step: Of the clock [s].
+        s: Which windows are tried.
+    """
+    count, lasts, turn, wide = len(times), float(times[-1] - times[0]), 0.0, 0.0
     # fine enough that the first and the last keep step
-    reach = 0.03 * median
-    tried = np.arange(-reach, reach, 0.1 * median**2 / (times[-1] - times[0] + median)) + median
-    phases = np.exp(2j * np.pi * (times - times[0])[None] / tried[:, None])
-    rayleigh = np.abs(phases.sum(1)) ** 2 / count
-    best = int(rayleigh.argmax())
-    period = float(tried[best])
-    # bursts that keep step, counted from the middle one, tell the period better than the grid does
-    turns = (times - times[count // 2]) / period
-    turns -= np.angle(np.exp(2j * np.pi * turns).sum()) / (2 * np.pi)
-    cycle = np.round(turns)
-    steady = np.abs(turns - cycle) < 0.15
+    reach = max(0.03 * about, step)
+    tried = np.arange(-reach, reach, 0.1 * about**2 / (lasts + about)) + about
+    phases = np.sort((times - times[0])[None] / tried[:, None] % 1.0, axis=1)
+    turns = np.concatenate([phases, phases + 1], axis=1)
+    out = about, 1.0
+    for window in {max(one, 1.5 * step / about) for one in s.windows}:
+        within = np.stack([np.searchsorted(row, row[:count] + window, "right") for row in turns])
+        most = (within - np.arange(count)).max(1)
+        best = int(most.argmax())
+        chance = count * float(stats.binom.sf(most[best] - 2, count - 1, window))
+        chance *= len(s.windows) * max(lasts / about, 1.0) / window
+        if most[best] >= s.fewest_frames and chance < out[1]:
+            out = float(tried[best]), chance
+            first = int((within[best] - np.arange(count)).argmax())
+            turn, wide = float(phases[best, first]) + 0.5 * window, window
+    period, p = out
+    # bursts that keep step tell the period better than the grid does
+    off = (times - times[0]) / period - turn
+    cycle = np.round(off)
+    steady = np.abs(off - cycle) <= 0.5 * wide
     if steady.sum() > 2 and np.ptp(cycle[steady]) > 0:
         period = float(np.polyfit(cycle[steady], times[steady], 1)[0])
-    return period, min(1.0, count**2 * math.exp(-float(rayleigh[best])))
+    return period, p
 
 
 def find_frame_coupling(
@@ -247,7 +287,7 @@ def _search_bursts(
         if len(peaks) < s.fewest_frames:
             continue
         times = clock.times[peaks]
-        period, p = _find_period(times)
+        period, p = _find_period(times, clock.settings.step, s)
         if best is None or p < best[2]:
             turn = float(np.angle(np.exp(2j * np.pi * times / period).sum()) / (2 * np.pi))
             last = clock.times[-1]

@@ -84,6 +84,17 @@ def test_the_first_of_many_events_is_not_early(scene):
     assert holds_frames(sent(rng.uniform(1 / 20, 1 / 11, len(frame)) + 0.1), scene)
 
 
+@pytest.mark.parametrize("early", [True, False])
+def test_events_that_are_late_by_different_times_tell_of_held_frames_as_well(scene, early, rng):
+    """A fifth of the time from frame to frame: too wide for a begin, and the rest of it has none."""
+    gap = float(np.diff(scene.sample_times())[0])
+    events = held_frames(scene, early=early, late=0.1 * gap)
+    t = events.t + rng.uniform(0.0, 0.2 * gap, len(events))
+    order = np.argsort(t, kind="stable")
+    spread = Events(t[order], events.x[order], events.y[order], events.p[order], WIDTH, HEIGHT)
+    assert holds_frames(spread, scene) == early
+
+
 def test_a_frame_at_its_own_time_is_not_early(scene):
     events = held_frames(scene, early=False)
     assert not holds_frames(events, scene)

@@ -19,7 +19,7 @@ from dase.effects.readout import Readout
 from dase.errors import InputError
 from dase.events import Events
 from dase.io.sequence import Sequence
-from dase.signatures.frame_coupling import BurstClock
+from dase.signatures.frame_coupling import BurstClock, CouplingSettings, _find_period
 from dase.signatures.result import Answer, Signature
 from perf.experiments.signatures import run as experiment
 
@@ -142,6 +142,32 @@ def test_bursts_with_the_frames_show_and_tell_their_times(plain, framed):
     assert entry.found
     assert entry.details["interval"] == pytest.approx(experiment.GAP, rel=2e-3)
     assert set(entry.details["phases"]) == {"ON", "OFF"}
+
+
+def test_few_bursts_that_all_keep_step_are_enough():
+    """Fourteen of each polarity, where a statistic of their phases alone needs some twenty."""
+    coupling = {"amplitude": 0.25, "spread": 0.3, "period": 0.05, "exposure": 0.0055, "begin": 0.01}
+    events = made(exposure=coupling)
+    entry = dase.find_signatures(events.select(events.t < 0.7))["frame coupling"]
+    assert entry.found
+    assert entry.details["interval"] == pytest.approx(0.05, rel=2e-3)
+
+
+def test_bursts_keep_step_among_others(rng):
+    others = np.sort(np.concatenate([0.007 + 0.05 * np.arange(16), rng.uniform(0.0, 0.8, 10)]))
+    period, p = _find_period(np.round(others / 5e-4) * 5e-4, 5e-4, CouplingSettings())
+    assert period == pytest.approx(0.05, rel=2e-3)
+    assert p < 1e-6
+
+
+def test_bursts_at_any_time_have_no_period(rng):
+    """Chances of what has none are as small as they say, or less so."""
+    chances = []
+    for _ in range(100):
+        times = np.unique(np.round(np.sort(rng.uniform(0.0, 0.8, 20)) / 5e-4)) * 5e-4
+        chances.append(_find_period(times, 5e-4, CouplingSettings())[1])
+    assert np.mean(np.array(chances) < 0.05) <= 0.05
+    assert min(chances) > 1e-4
 
 
 def test_bursts_go_on_after_the_clock_ends():
