@@ -134,7 +134,7 @@ def lens_between_events(
     def differ(width: float) -> tuple[float, float]:
         seen = behind_lens(measurement, width) if width else measurement
         light = LightBetweenEvents.of(seen, log_eps=log_eps)
-        return (math.nan, math.nan) if light is None else _differences(light.seen, settings)
+        return (math.inf, math.inf) if light is None else _differences(light.seen, settings)
 
     sharp = differ(0.0)
     if not all(math.isfinite(one) for one in sharp):
@@ -170,13 +170,13 @@ def _is_lens(sharp: tuple[float, float], behind: tuple[float, float], settings: 
 
 def _ratio(sharp: tuple[float, float], behind: tuple[float, float]) -> float:
     """Return what steps differ by behind a lens, relative to without it, of the polarity with more."""
-    return max(b / a if a > 0 else math.inf for a, b in zip(sharp, behind, strict=True))
+    return max(b / a if 0 < a < math.inf else math.inf for a, b in zip(sharp, behind, strict=True))
 
 
 def _differences(steps: LightSteps, settings: LensSettings = LENS) -> tuple[float, float]:
     """Return what ON and OFF steps differ by: half of what two thirds lie in, relative to their median.
 
-    NaN for a polarity with too few.
+    Infinite for a polarity with too few.
 
     Args:
         steps: From event to event.
@@ -186,11 +186,11 @@ def _differences(steps: LightSteps, settings: LensSettings = LENS) -> tuple[floa
     for on in (True, False):
         moved = steps.change[steps.counts & (steps.on == on) & (steps.gap < settings.longest)]
         if len(moved) < settings.steps:
-            out.append(math.nan)
+            out.append(math.inf)
             continue
         low, middle, high = np.quantile(moved, [0.16, 0.5, 0.84])
         as_far = float(middle) if on else -float(middle)
-        out.append(0.5 * float(high - low) / as_far if as_far > 0 else math.nan)
+        out.append(0.5 * float(high - low) / as_far if as_far > 0 else math.inf)
     return out[0], out[1]
 
 

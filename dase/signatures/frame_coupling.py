@@ -35,6 +35,7 @@ class CouplingSettings:
     shortest: float = 0.014  # [s] what repeats sooner is a lamp: it has 100 or 120 cycles per second
     windows: tuple[float, ...] = (0.03, 0.06, 0.12)  # of a period, in which bursts in step with frames come
     periods: int = 24  # that lie between most pairs of bursts are tried
+    bursts: int = 200  # of these the first tell the period, the others how exactly
     margin: float = 0.003  # [s] left out on both sides of a burst
     most_margin: float = 0.1  # share of the interval, so that short ones keep time between their bursts
     tiles: float = 0.4  # share of the active tiles that take part in a burst of the whole array
@@ -175,55 +176,62 @@ def _find_period(times: NDArray[np.float64], step: float, s: CouplingSettings) -
         step: Of the clock that tells them [s].
         s: Which periods and windows are tried.
     """
-    count = len(times)
-    apart = (times[None] - times[:, None])[np.triu_indices(count, 1)]
-    apart = apart[(apart >= 2 * step) & (apart <= (times[-1] - times[0]) / (s.fewest_frames - 1) + step)]
+    few = times[: s.bursts]
+    apart = (few[None] - few[:, None])[np.triu_indices(len(few), 1)]
+    apart = apart[(apart >= 2 * step) & (apart <= (few[-1] - few[0]) / (s.fewest_frames - 1) + step)]
     near = np.bincount(np.round(apart / step).astype(np.int64)) if len(apart) else np.zeros(1)
     often = np.argsort(near + np.roll(near, 1) + np.roll(near, -1))[::-1][: s.periods]
-    best = (float(np.median(np.diff(times))), 1.0)
-    for about in (best[0], *(step * float(one) for one in often if near[one])):
-        period, p = _refine_period(times, about, step, s)
-        if p < best[1]:
-            best = period, p
-    return best[0], min(1.0, 0.5 * count**2 * best[1])
+    about = [float(np.median(np.diff(few))), *(step * float(one) for one in often if near[one])]
+    period, turn, window, p = min(
+        (_refine_period(few, one, step, s) for one in about), key=lambda one: one[3]
+    )
+    # bursts that keep step tell the period better than the grid does, and the more the longer they do
+    for count in sorted({min(len(few) << n, len(times)) for n in range(32)}):
+        off = (times[:count] - times[0]) / period - turn
+        cycle = np.round(off)
+        steady = np.abs(off - cycle) <= 0.5 * window
+        if steady.sum() > 2 and np.ptp(cycle[steady]) > 0:
+            period = float(np.polyfit(cycle[steady], times[:count][steady], 1)[0])
+    return period, min(1.0, 0.5 * len(few) ** 2 * p)
 
 
 def _refine_period(
     times: NDArray[np.float64], about: float, step: float, s: CouplingSettings
-) -> tuple[float, float]:
-    """Return the period near one by which most bursts keep step [s], and the chance of as many at one period.
+) -> tuple[float, float, float, float]:
+    """Return the period near one by which most bursts keep step, and the chance of as many at one period.
 
     Args:
         times: Of the bursts, ascending [s], shape (n,).
         about: The period, to a step of the clock [s].
         step: Of the clock [s].
         s: Which windows are tried.
+
+    Returns:
+        The period [s], the phase of the bursts after the first one and the window in which they come [turns],
+        and the chance.
     """
-    count, lasts, turn, wide = len(times), float(times[-1] - times[0]), 0.0, 0.0
+    count, lasts = len(times), float(times[-1] - times[0])
     # fine enough that the first and the last keep step
     reach = max(0.03 * about, step)
     tried = np.arange(-reach, reach, 0.1 * about**2 / (lasts + about)) + about
     phases = np.sort((times - times[0])[None] / tried[:, None] % 1.0, axis=1)
-    turns = np.concatenate([phases, phases + 1], axis=1)
-    out = about, 1.0
-    for window in {max(one, 1.5 * step / about) for one in s.windows}:
-        within = np.stack([np.searchsorted(row, row[:count] + window, "right") for row in turns])
-        most = (within - np.arange(count)).max(1)
+    # one after the other, so that all of them are looked up at once
+    apart = 3.0 * np.arange(len(tried))[:, None]
+    turns = (np.concatenate([phases, phases + 1], axis=1) + apart).ravel()
+    ahead = 2 * count * np.arange(len(tried))[:, None] + np.arange(count)
+    out = about, 0.0, 0.0, 1.0
+    for window in sorted({max(one, 1.5 * step / about) for one in s.windows}):
+        inside = (
+            np.searchsorted(turns, (phases + apart + window).ravel(), "right").reshape(phases.shape) - ahead
+        )
+        most = inside.max(1)
         best = int(most.argmax())
         chance = count * float(stats.binom.sf(most[best] - 2, count - 1, window))
         chance *= len(s.windows) * max(lasts / about, 1.0) / window
-        if most[best] >= s.fewest_frames and chance < out[1]:
-            out = float(tried[best]), chance
-            first = int((within[best] - np.arange(count)).argmax())
-            turn, wide = float(phases[best, first]) + 0.5 * window, window
-    period, p = out
-    # bursts that keep step tell the period better than the grid does
-    off = (times - times[0]) / period - turn
-    cycle = np.round(off)
-    steady = np.abs(off - cycle) <= 0.5 * wide
-    if steady.sum() > 2 and np.ptp(cycle[steady]) > 0:
-        period = float(np.polyfit(cycle[steady], times[steady], 1)[0])
-    return period, p
+        if most[best] >= s.fewest_frames and chance < out[3]:
+            turn = float(phases[best, int(inside[best].argmax())]) + 0.5 * window
+            out = float(tried[best]), turn, window, chance
+    return out
 
 
 def find_frame_coupling(
