@@ -138,13 +138,11 @@ def holds_frames(events: Events, scene: Scene, settings: HeldClipSettings = HELD
         return False
     phase = late / gap
     begin, spread = begin_of_events(phase % 1.0, settings)
+    lies_apart = begin is None
     if begin is None:  # latencies that differ and stamps that are off put them farther apart
         begin, spread = _begin_of_all(phase % 1.0, settings), False
-        lies_apart = True
-    else:
-        lies_apart = False
-        if at_frame.any() and begin_of_events(phase[~at_frame] % 1.0, settings)[0] is None:
-            return False  # noise that is drawn at each frame, and light that goes from frame to frame
+    elif at_frame.any() and begin_of_events(phase[~at_frame] % 1.0, settings)[0] is None:
+        return False  # noise that is drawn at each frame, and light that goes from frame to frame
     # soon after a frame all parts lie close together
     clear = phase > settings.clear
     if begin is None or (spread and even[clear].mean() >= settings.at_parts):
