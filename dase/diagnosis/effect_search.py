@@ -67,8 +67,9 @@ def search_effects(
     if most > 0 and not reaches_floor(judgement) and LENS in task.effects:
         task.progress("looking at the lens", 0.0, judgement.error)
         known = task.given | state.path.certain
+        first = [one.model for one in state.path.first]
         state.other_scene = seen_through_a_lens(
-            compared.measurement, model, judgement.error, known, compared.split, seed=task.seed
+            compared.measurement, model, judgement.error, known, first, compared.split, seed=task.seed
         )
         if state.other_scene is not None:
             return model, judgement

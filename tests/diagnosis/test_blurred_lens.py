@@ -105,6 +105,34 @@ def test_a_lens_and_a_dark_current_are_told_apart(scene):
 
 
 @pytest.mark.slow
+def test_a_lens_and_a_latency_are_told_apart(scene):
+    """Light is looked up too late, so that steps do not show the lens, and a latency alone leaves much."""
+    events = behind_lens(scene, SIGMA, EFFECTS["latency"](delay=5e-3))
+    assert lens_between_events(as_measurement(events, scene), log_eps=1e-3) is None
+    tried = TRIED | {"latency": EFFECTS["latency"], "linlog": EFFECTS["linlog"]}
+    found = dase.diagnose(
+        events, "ideal", scene=scene, effects=tried, most=2, pixels=PIXELS, settings=NO_LIMITS
+    )
+    assert {one.effect: one.grade for one in found.findings} == {
+        "optics_blur": Grade.SUPPORTED, "latency": Grade.SUPPORTED,
+    }  # fmt: skip
+    assert found.parameters["optics_blur.sigma"].value == pytest.approx(SIGMA, rel=0.06)
+    assert found.parameters["latency.delay"].value == pytest.approx(5e-3, rel=0.1)
+
+
+@pytest.mark.slow
+def test_what_nobody_knows_beside_a_latency_is_no_lens(scene):
+    hidden = (EFFECTS["latency"](delay=5e-3), EFFECTS["second_order"](cutoff=30.0))
+    events = dase.simulate(scene, dase.Sensor((*hidden, EFFECTS["threshold"](on=0.2, off=0.22))), seed=1)
+    tried = {name: EFFECTS[name] for name in ("optics_blur", "latency", "jitter", "leak", "shot", "mismatch")}
+    found = dase.diagnose(
+        events, "ideal", scene=scene, effects=tried, most=2, pixels=PIXELS, settings=NO_LIMITS
+    )
+    assert found.unexplained is not None
+    assert "optics_blur" not in {one.effect for one in (*found.findings, *found.stand_ins)}
+
+
+@pytest.mark.slow
 def test_a_slow_photoreceptor_that_nobody_knows_is_no_lens(scene):
     sensor = dase.Sensor((Bandwidth(cutoff=25.0), dase.EFFECTS["threshold"](on=0.2, off=0.22)))
     events = dase.simulate(scene, sensor, seed=1)
