@@ -41,6 +41,7 @@ class FlickerSettings:
     spacing: float = 0.25  # of tried frequencies, relative to what the length resolves
     periods: int = 6  # at most, of the tone, in one of what it may be an overtone of
     between: float = 0.25  # of the tone's amplitude, at a frequency between its multiples: no lamp's
+    between_chance: float = 0.01  # that a lamp is taken for a longer period's by what is there by chance
 
 
 @dataclass(frozen=True)
@@ -181,9 +182,7 @@ def _find_tone(
     return float(tones[np.where(clear, power, -1.0).argmax()] * spacing), chance, many
 
 
-def _longer_period(
-    v: NDArray[np.float64], step: float, frequency: float, level: float, s: FlickerSettings
-) -> float:
+def _longer_period(v: NDArray[np.float64], step: float, frequency: float, s: FlickerSettings) -> float:
     """Return the period of which a tone is an overtone [s], 0 where it is the tone's own.
 
     A lamp has multiples of its frequency and nothing between. Bursts of the array have all multiples of their
@@ -208,7 +207,7 @@ def _longer_period(
         if not len(cells):
             continue
         p = float(stats.gamma.sf(rayleigh[cells].sum(), segments * len(cells)))
-        if p * s.periods < level and power[cells].max() > s.between**2 * strongest:
+        if p * s.periods < s.between_chance and power[cells].max() > s.between**2 * strongest:
             return many / frequency
     return 0.0
 
@@ -338,7 +337,7 @@ def find_flicker(
     if frequency < s.slowest_lamp:
         reason = f"{frequency:.2f} Hz: no lamp is as slow, frames are"
         return replace(found, answer=Answer.CANNOT_SAY, sentence=reason), None
-    longer = 0.0 if bursts is not None else _longer_period(v, step, frequency, level, s)
+    longer = 0.0 if bursts is not None else _longer_period(v, step, frequency, s)
     if longer:
         reason = f"{frequency:.2f} Hz, of what repeats after {format_seconds(longer)} only: no lamp's light"
         return replace(found, answer=Answer.CANNOT_SAY, sentence=reason), None

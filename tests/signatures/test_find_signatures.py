@@ -349,6 +349,28 @@ def test_events_at_parts_of_a_frame_are_not_double(rng, most):
     assert not dase.find_signatures(in_turn(rng, 0.0, most))["double events"].found
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_noise_in_step_with_two_tones_is_no_lamp(seed):
+    """A hash in place of random numbers gives noise times in common: 310 Hz, and 155 Hz half as strong."""
+
+    rng = np.random.default_rng(seed)
+
+    def noise(seconds, half):
+        t = np.sort(rng.random(round(22_000 * seconds))) * seconds
+        turn = 2 * np.pi * 154.945 * t
+        on = rng.random(len(t)) < 0.5 + 0.09 * np.cos(2 * turn) + half * np.cos(turn)
+        x, y = rng.integers(0, 96, len(t)), rng.integers(0, 72, len(t))
+        return Events(t, x.astype(np.uint16), y.astype(np.uint16), on, 96, 72)
+
+    entry = dase.find_signatures(noise(0.96, 0.04))["flicker"]
+    assert entry.p < 1e-4
+    assert not entry.found
+    assert "of what repeats after 6.4" in entry.sentence
+    lamp = dase.find_signatures(noise(1.8, 0.0))["flicker"]
+    assert lamp.found
+    assert lamp.details["frequency"] == pytest.approx(309.89, abs=0.2)
+
+
 def test_weak_bursts_that_take_turns_are_no_lamp():
     """ON and OFF bursts half a frame's exposure apart are strongest at twice the frame rate."""
     events = made(kind="objects", exposure={"amplitude": 0.1, "period": 0.04, "exposure": 0.01})
