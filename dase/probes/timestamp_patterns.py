@@ -28,6 +28,12 @@ class PatternSettings:
     certain: float = 0.97
     """Share of events that must follow a regularity."""
 
+    repeats: float = 30e-6
+    """Shorter gaps of a line may be those of events that are repeated at once [s]."""
+
+    multiples: int = 6
+    """Scans in the shortest gap of a line, at most: pixels that send once in a frame skip some."""
+
     scanned: int = 50_000
     """Events in which a readout's lines are looked for."""
 
@@ -112,7 +118,8 @@ def find_structure(events: Events) -> TimestampStructure:
             best = TimestampStructure(line=line, direction=direction)
     # all of them tell its length better
     if best.line:
-        best = replace(best, line=line_time(events, best.direction))
+        scan = best.line * readout_lines(events, best.direction)[0]
+        best = replace(best, line=line_time(events, best.direction, scan))
     elif clock_period(events.t[: PATTERNS.ticked]):  # the lines of a scan are read at ticks too
         best = TimestampStructure(step=clock_period(events.t))
     return best if best.shares(events).max() >= PATTERNS.certain else TimestampStructure()
@@ -154,8 +161,14 @@ def spread_over(t: NDArray[np.float64], step: float) -> bool:
     return len(np.unique(np.round(t / step))) >= 20
 
 
-def line_time(events: Events, direction: str) -> float:
-    """Return the time from line to line of a readout [s], 0 where there is none in this direction."""
+def line_time(events: Events, direction: str, scan: float = 0.0) -> float:
+    """Return the time from line to line of a readout [s], 0 where there is none in this direction.
+
+    Args:
+        events: In order of time.
+        direction: In which it goes.
+        scan: What a scan takes [s], where that is known; 0 where not.
+    """
     lines, place = readout_lines(events, direction)
     order = np.argsort(place.astype(np.uint16), kind="stable")  # times are in order
     t, where = events.t[order], place[order]
@@ -163,9 +176,13 @@ def line_time(events: Events, direction: str) -> float:
     gaps = gaps[gaps > PATTERNS.shortest]
     if len(gaps) < 50:
         return 0.0
-    scan = float(np.quantile(gaps, 0.02))
+    longer = gaps[gaps > PATTERNS.repeats]
+    shortest = {float(np.quantile(some, 0.02)) for some in (gaps, longer) if len(some) >= 50}
+    tried = [gap / many for many in range(1, PATTERNS.multiples + 1) for gap in sorted(shortest)]
     # all stamps of a line are at one phase of the scan; phases of lines follow each other
     busy = np.bincount(where.astype(np.int64), minlength=lines).argmax()
-    scan = refine_period(t[where == busy], scan)
-    line = scan / lines
-    return line if share_in_scan(events.t, place, line, lines) >= PATTERNS.certain else 0.0
+    for start in [scan] if scan else tried:
+        line = refine_period(t[where == busy], start) / lines
+        if line > 0 and share_in_scan(events.t, place, line, lines) >= PATTERNS.certain:
+            return line
+    return 0.0

@@ -326,6 +326,27 @@ def test_regular_time_stamps_are_found(scene, effect):
     assert found.shares(events).max() > 0.97
 
 
+@pytest.mark.parametrize("doubles", [0.0, 0.02])
+@pytest.mark.parametrize("scan", [211e-6, 540e-6, 900e-6])
+def test_a_scan_is_found_where_pixels_send_once_in_a_frame(rng, scan, doubles):
+    """No two events of a row are less than two scans apart, but for those that are repeated at once."""
+    frame = np.repeat(np.arange(1000), 20)
+    x, y = (rng.integers(0, size, len(frame)).astype(np.uint16) for size in (64, 48))
+    begin = y * (scan / 48)
+    t = np.ceil((frame * 2.6 * scan - begin) / scan) * scan + begin
+    again = rng.random(len(t)) < doubles
+    t, x, y = (np.concatenate([one, one[again]]) for one in (t, x, y))
+    t[len(frame) :] += 5e-6
+    order = np.argsort(t, kind="stable")
+    sent = dase.Events(np.round(t[order], 6), x[order], y[order], np.ones(len(t), bool), 64, 48)
+    found = find_structure(sent)
+    assert found.direction == "down"
+    assert found.line * 48 == pytest.approx(scan, rel=1e-3)
+    # without the scan there is none
+    moved = np.sort(np.round(sent.t + 0.5 * scan * rng.random(len(t)), 6))
+    assert find_structure(replace(sent, t=moved)) == TimestampStructure()
+
+
 def test_a_scan_that_begins_anywhere_and_pauses_is_found(scene):
     """As real ones do: the clock of the file begins within a scan, and between scans nothing is read."""
     events = dase.simulate(scene, Sensor().with_effect(EFFECTS["shot"](rate=20.0)), seed=1)
