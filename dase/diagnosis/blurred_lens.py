@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from functools import cache, partial
+from functools import cache, lru_cache, partial
 
 import numpy as np
 
@@ -237,11 +237,14 @@ def seen_through_a_lens(
     tried = [(bare, [axis.name for axis in model.space.axes if axis.effect.name in bare])]
     tried += [(one.sensor, [axis.name for axis in one.space.axes]) for one in first[: settings.others]]
 
+    @lru_cache(len(settings.widths))  # of those that each is tried behind
+    def seen_behind(width: float) -> SplitMeasurement:
+        return split(behind_lens(measurement, width).scene)
+
     @cache
     def left(which: int, width: float) -> float:
-        evidence = split(behind_lens(measurement, width).scene)
-        fitted = fit_present_model(evidence, *tried[which], seed=seed)
-        return error_of_choice(evidence, fitted, seed=seed)
+        fitted = fit_present_model(seen_behind(width), *tried[which], seed=seed)
+        return error_of_choice(seen_behind(width), fitted, seed=seed)
 
     share = settings.better if bare == model.sensor else settings.simpler
     width = best_width(partial(left, 0), share * error, settings)

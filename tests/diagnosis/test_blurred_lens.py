@@ -15,7 +15,7 @@ from dase.effects.bandwidth import Bandwidth
 from dase.effects.optics_blur import OpticsBlur, blur_weights
 from dase.events import Events
 from dase.fitting.measurement import Measurement, as_measurement
-from dase.results import Grade
+from dase.results import Diagnosis, Grade
 from dase.scenes.video import VideoScene
 
 SIGMA = 1.3
@@ -41,12 +41,17 @@ def behind_lens(scene: VideoScene, sigma: float, *more: dase.Effect) -> Events:
     return dase.simulate(VideoScene(np.stack(light), times), sensor, seed=1)
 
 
+def diagnose_briefly(events: Events, scene: VideoScene, effects: dict[str, type[dase.Effect]]) -> Diagnosis:
+    """Return a diagnosis of few pixels, of two effects at most."""
+    return dase.diagnose(
+        events, "ideal", scene=scene, effects=effects, most=2, pixels=PIXELS, settings=NO_LIMITS
+    )
+
+
 @pytest.mark.slow
 def test_a_lens_is_found_beside_a_leak(scene):
     events = behind_lens(scene, SIGMA, dase.EFFECTS["leak"](rate=4.0))
-    found = dase.diagnose(
-        events, "ideal", scene=scene, effects=TRIED, most=2, pixels=PIXELS, settings=NO_LIMITS
-    )
+    found = diagnose_briefly(events, scene, TRIED)
     assert found.selected == ("optics_blur", "leak")
     width = found.parameters["optics_blur.sigma"]
     assert width.value == pytest.approx(SIGMA, rel=0.06)
@@ -94,9 +99,7 @@ def test_a_lens_and_a_dark_current_are_told_apart(scene):
     """Neither leaves little by itself, and light that is too sharp looks like a jitter."""
     events = behind_lens(scene, SIGMA, EFFECTS["dark"](current=0.05))
     tried = TRIED | {"dark": EFFECTS["dark"]}
-    found = dase.diagnose(
-        events, "ideal", scene=scene, effects=tried, most=2, pixels=PIXELS, settings=NO_LIMITS
-    )
+    found = diagnose_briefly(events, scene, tried)
     assert {one.effect: one.grade for one in found.findings} == {
         "optics_blur": Grade.CERTAIN, "dark": Grade.SUPPORTED,
     }  # fmt: skip
@@ -110,9 +113,7 @@ def test_a_lens_and_a_latency_are_told_apart(scene):
     events = behind_lens(scene, SIGMA, EFFECTS["latency"](delay=5e-3))
     assert lens_between_events(as_measurement(events, scene), log_eps=1e-3) is None
     tried = TRIED | {"latency": EFFECTS["latency"], "linlog": EFFECTS["linlog"]}
-    found = dase.diagnose(
-        events, "ideal", scene=scene, effects=tried, most=2, pixels=PIXELS, settings=NO_LIMITS
-    )
+    found = diagnose_briefly(events, scene, tried)
     assert {one.effect: one.grade for one in found.findings} == {
         "optics_blur": Grade.SUPPORTED, "latency": Grade.SUPPORTED,
     }  # fmt: skip
@@ -125,9 +126,7 @@ def test_what_nobody_knows_beside_a_latency_is_no_lens(scene):
     hidden = (EFFECTS["latency"](delay=5e-3), EFFECTS["second_order"](cutoff=30.0))
     events = dase.simulate(scene, dase.Sensor((*hidden, EFFECTS["threshold"](on=0.2, off=0.22))), seed=1)
     tried = {name: EFFECTS[name] for name in ("optics_blur", "latency", "jitter", "leak", "shot", "mismatch")}
-    found = dase.diagnose(
-        events, "ideal", scene=scene, effects=tried, most=2, pixels=PIXELS, settings=NO_LIMITS
-    )
+    found = diagnose_briefly(events, scene, tried)
     assert found.unexplained is not None
     assert "optics_blur" not in {one.effect for one in (*found.findings, *found.stand_ins)}
 
@@ -137,9 +136,7 @@ def test_a_slow_photoreceptor_that_nobody_knows_is_no_lens(scene):
     sensor = dase.Sensor((Bandwidth(cutoff=25.0), dase.EFFECTS["threshold"](on=0.2, off=0.22)))
     events = dase.simulate(scene, sensor, seed=1)
     known = {name: effect for name, effect in TRIED.items() if name != "bandwidth"}
-    found = dase.diagnose(
-        events, "ideal", scene=scene, effects=known, most=2, pixels=PIXELS, settings=NO_LIMITS
-    )
+    found = diagnose_briefly(events, scene, known)
     assert "optics_blur" not in {one.effect for one in found.findings}
 
 
