@@ -14,6 +14,11 @@ from dase.diagnosis.compared_measurement import ComparedMeasurement, choose_comp
 from dase.diagnosis.conclusion import conclude_diagnosis, known_so_far
 from dase.diagnosis.dead_time import EFFECT as REFRACTORY
 from dase.diagnosis.dead_time import with_dead_time
+from dase.diagnosis.direct_readings import (
+    with_direct_readings,
+    with_drawn_thresholds,
+    with_jitter_of_events,
+)
 from dase.diagnosis.effect_search import search_effects
 from dase.diagnosis.few_hot_pixels import hot_effect_of, with_hot_pixels
 from dase.diagnosis.held_frames import (
@@ -35,6 +40,7 @@ from dase.diagnosis.state import DiagnosisState, DiagnosisTask
 from dase.diagnosis.unequal_thresholds import EFFECT as MISMATCH
 from dase.diagnosis.unequal_thresholds import with_unequal_thresholds
 from dase.effects import EFFECTS, Effect
+from dase.effects.jitter import Jitter
 from dase.effects.optics_blur import OpticsBlur
 from dase.fitting.burst_strength import BurstStrength, put_in_step
 from dase.fitting.data_split import SPLIT
@@ -55,6 +61,8 @@ from dase.scenes.grey_steps import grey_step_of
 from dase.signatures.kinds import DEAD_TIME, DOUBLE_EVENTS, UNEQUAL_THRESHOLDS
 from dase.simulation.sensor import Sensor
 from dase.simulation.sensor_file import as_sensor
+
+JITTER = Jitter.name
 
 
 def diagnose(
@@ -188,6 +196,8 @@ def _begin_search(
     if given is not bare:
         # how often a held frame makes pixels send is counted, and no fit tells it better
         free = [axis.name for axis in axes_of(bare, free)]
+        if JITTER in effects:
+            given = with_drawn_thresholds(given, compared.measurement)
     tell("fitting the present model", 0.0, float("nan"))
     task = DiagnosisTask(
         evidence, compared.candidates(effects), compared.seed, tell,
@@ -268,6 +278,10 @@ def _with_what_pixels_show(
     forgets = REFRACTORY in task.given and REFRACTORY not in compared.given
     if forgets and REFRACTORY in task.effects and not contradicted:
         found = with_longer_dead_time(found, task, measurement, model)
+    if JITTER in task.given and JITTER not in compared.given:
+        found = with_jitter_of_events(found, model.sensor)
+    if not contradicted:
+        found = with_direct_readings(found, task, measurement)
     if unequal is not None and MISMATCH in task.effects:
         found = with_unequal_thresholds(found, unequal)
     silent = compared.silent

@@ -93,6 +93,8 @@ def fewest_frames(measurement: Measurement, settings: HeldFrameSettings = HELD_F
     out = [first]
     if first + 1 < len(counts) and counts[first] < settings.clear * counts[first + 1]:
         out.append(first + 1)
+    if first > 1:
+        out.append(1)  # where light is slow no pixel asks for more, and the frames between say nothing
     _, are_spread = begin_of_events(_phases(measurement))
     return (*out, 0) if are_spread else tuple(out)
 
@@ -125,11 +127,20 @@ def with_frame_as_memory(
         for frames in fewest
         if frames
     ]
-    errors = [_error_of(evidence, one, sensor, free, seed=seed, settings=settings) for one in waits]
+    error = partial(_error_of, evidence, seed=seed, settings=settings)
+    errors = [error(one, sensor, free) for one in waits]
+    begin, _ = begin_of_events(_phases(measurement))
+    if begin is not None and begin > settings.at_once:
+        # or it waits until an event is out that comes as many frames later
+        for frames in (one for one in fewest if one > 1):
+            late = Latency(delay=(frames - 1 + begin) * measurement.held, light=0.0)
+            memory = Refractory(period=(frames - 0.5) * measurement.held, mode="reset")
+            waits.append(sensor.with_effect(memory))
+            errors.append(error(waits[-1].with_effect(late), sensor, free))
     if 0 in fewest:
         for one in (_waiting_for_jump(sensor, evidence), sensor):
             slow = _slow(one, measurement.held)
-            errors.append(_error_of(evidence, slow, slow.without(EFFECT), None, seed=seed, settings=settings))
+            errors.append(error(slow, slow.without(EFFECT), None))
             waits.append(one)
     return waits[int(np.argmin(errors))]
 

@@ -155,6 +155,9 @@ class VideoScene(Scene):
     held_for = 0.0
     """Time for which each frame is shown unchanged [s]; 0 where light goes straight from frame to frame."""
 
+    parts = 1
+    """Samples of a held frame."""
+
     by_frames = False
     """Whether a simulator has filtered light from frame to frame, and knows none between them."""
 
@@ -205,6 +208,10 @@ class VideoScene(Scene):
         """Return the times of the frames [s]."""
         return self._times
 
+    def frame_times(self) -> NDArray[np.float64]:
+        """Return the times that are written beside the frames [s], whether they are held or not."""
+        return self._times[:: self.parts] + EARLY if self.held_for else self._times
+
     def known_at_frames(self) -> VideoScene:
         """Return the light as a simulator takes it that knows the frames alone."""
         other = copy(self)
@@ -233,7 +240,7 @@ class VideoScene(Scene):
         index = np.concatenate(([0], np.repeat(np.arange(1, len(self._times)), parts)))
         times = np.concatenate((self._times[:1], inner.ravel())) - EARLY
         out = VideoScene(RepeatedFrames(self._frames, index), times, gamma=self.gamma)
-        out.held_for = self.longest_gap()
+        out.held_for, out.parts = self.longest_gap(), parts
         return out
 
     def blurred(self, weights: NDArray[np.float32]) -> VideoScene:
@@ -248,7 +255,7 @@ class VideoScene(Scene):
         else:
             frames = BlurredFrames(self._frames, self.gamma, weights)
         out = VideoScene(frames, self._times)
-        out.held_for, out.by_frames = self.held_for, self.by_frames
+        out.held_for, out.parts, out.by_frames = self.held_for, self.parts, self.by_frames
         out.sharp, out._lens_weights = self, weights
         return out
 

@@ -1,0 +1,235 @@
+"""What events of held frames tell without a fit: a latency, a low-pass, errors of the stamps, and a jitter.
+
+No fit to statistics in steps of a millisecond tells a tenth of one; where frames are held each event does.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from dase.diagnosis.state import DiagnosisTask
+from dase.effects import Effect
+from dase.effects.bandwidth import Bandwidth
+from dase.effects.jitter import Jitter
+from dase.effects.latency import Latency
+from dase.effects.refractory import Refractory
+from dase.effects.timestamp import Timestamp
+from dase.fitting.delays_after_frames import DelaysAfterFrames, delays_after_frames, slope_in_errors
+from dase.fitting.held_events import HeldEvents
+from dase.fitting.measurement import Measurement
+from dase.fitting.thresholds_of_frames import DrawnThresholds, thresholds_of_frames
+from dase.formatting import format_percent, format_seconds
+from dase.results import Diagnosis, Estimate, Finding, Grade
+from dase.scenes.video import VideoScene
+from dase.signatures.chance import NINETY
+from dase.simulation.sensor import Sensor
+
+
+@dataclass(frozen=True)
+class ReadingSettings:
+    """From which sizes on delays are findings.
+
+    IEBCS by itself is 100 us late, give or take 10 us, behind a low-pass of 40 kHz at its brightest.
+    """
+
+    width: float = 0.25
+    """Share of the time from frame to frame in which most events with a short way come, at most."""
+
+    latency: float = 150e-6
+    """[s] At least."""
+
+    jitter: float = 25e-6
+    """[s] At least."""
+
+    even: float = 1.5
+    """By how much the early half of the delays may widen with the way: what a low-pass adds does."""
+
+    cutoff: float = 1e4
+    """[Hz] At most, at intensity 1."""
+
+    errors: float = 5.0
+    """Standard errors by which delays grow with the way, at least, for a low-pass."""
+
+    own: float = 0.3
+    """Share of the variance of thresholds that stays from event to event, at most, for a jitter: -0.2 to 0.1
+    in 15 clips, 0.7 where pixels have thresholds of their own."""
+
+    least_jitter: float = 0.01
+    """Spread of thresholds from event to event that the model has before the search, at least, relative."""
+
+    named_jitter: float = 0.05
+    """The same of a finding: IEBCS by itself has 0.02 to 0.03."""
+
+    most_jitter: float = 0.6
+    """The same, at most: more is not of thresholds."""
+
+    unlike: float = 2.0
+    """Times that the spread of one polarity may be that of the other: where bursts of the array come between
+    events it was 11."""
+
+    known: float = 0.03
+    """Error of a delay beside chance, relative: how far a pixel has to go is known from thresholds that
+    differ."""
+
+
+READINGS = ReadingSettings()
+
+
+def with_direct_readings(
+    found: Diagnosis, task: DiagnosisTask, measurement: Measurement, settings: ReadingSettings = READINGS
+) -> Diagnosis:
+    """Return a diagnosis of held frames in which all that the delays of their events show is certain.
+
+    Args:
+        found: By the search.
+        task: What the diagnosis is asked.
+        measurement: The light and the events.
+        settings: What counts.
+    """
+    scene = measurement.scene
+    if not isinstance(scene, VideoScene) or not measurement.held or measurement.trust is not None:
+        return found
+    delays = delays_after_frames(measurement.compared_events(), scene)
+    effects = (
+        []
+        if delays is None or delays.width() > settings.width
+        else _effects_of(delays.brighter_half(), settings)
+    )
+    for effect, sentence, mine in effects:
+        if effect.name not in task.effects or effect.name in task.given:
+            continue
+        if isinstance(effect, Latency) and _waits_for_frames(found.sensor, effect, measurement.held):
+            continue  # only the search tells by how many frames more events are late
+        found = _with_certain(found, effect, sentence, mine)
+    return found
+
+
+def _waits_for_frames(sensor: Sensor, effect: Latency, gap: float) -> bool:
+    """Return whether events may be late by frames `gap` [s] apart, beside what is read off after the last."""
+    known = [one.delay for one in sensor.effects if isinstance(one, Latency)]
+    waits = [one.period for one in sensor.effects if isinstance(one, Refractory)]
+    return any(abs(one - effect.delay) > 0.5 * gap for one in known) or any(one > gap for one in waits)
+
+
+def with_drawn_thresholds(
+    sensor: Sensor, measurement: Measurement, settings: ReadingSettings = READINGS
+) -> Sensor:
+    """Return a sensor with the jitter that events of held frames have, one by one.
+
+    Args:
+        sensor: Takes the light of a frame for its memory.
+        measurement: The light and the events.
+        settings: What counts as a jitter.
+    """
+    scene, memory = measurement.scene, sensor[Refractory.name]
+    if Jitter.name in sensor or not isinstance(scene, VideoScene) or measurement.trust is not None:
+        return sensor
+    assert isinstance(memory, Refractory)
+    seen = HeldEvents.of(measurement.compared_events(), scene)
+    drawn = thresholds_of_frames(seen, wait=round(memory.period / measurement.held + 0.5))
+    if not drawn or not all(_are_drawn_anew(one, settings) for one in drawn.values()):
+        return sensor
+    spreads = [one.spread for one in drawn.values()]
+    if max(spreads) > settings.unlike * min(spreads):
+        return sensor
+    return sensor.with_effect(Jitter(spread=float(np.mean(spreads))))
+
+
+def _are_drawn_anew(found: DrawnThresholds, settings: ReadingSettings) -> bool:
+    """Return whether thresholds are drawn at each event; of small spreads that need not be known."""
+    if not settings.least_jitter <= found.spread <= settings.most_jitter:
+        return False
+    if math.isnan(found.own):
+        return found.spread < settings.named_jitter
+    return abs(found.own) <= settings.own
+
+
+def with_jitter_of_events(found: Diagnosis, model: Sensor, settings: ReadingSettings = READINGS) -> Diagnosis:
+    """Return a diagnosis in which a jitter is certain that its model had before the search.
+
+    Args:
+        found: By the search.
+        model: Has a jitter that was read off.
+        settings: From which size on it is a finding.
+    """
+    effect = model[Jitter.name]
+    assert isinstance(effect, Jitter)
+    spread = format_percent(effect.spread)
+    if effect.spread < settings.named_jitter:
+        note = f"thresholds that differ by {spread} from event to event are in the model, and no finding"
+        return replace(found, notes=(*found.notes, note))
+    half = settings.known * effect.spread
+    mine = {"jitter.spread": Estimate(effect.spread, effect.spread - half, effect.spread + half)}
+    sentence = (
+        f"thresholds are drawn anew at each event, with a spread of {spread}: frames lie on either side"
+    )
+    return _with_certain(found, effect, sentence, mine)
+
+
+def _effects_of(
+    delays: DelaysAfterFrames, settings: ReadingSettings
+) -> list[tuple[Effect, str, dict[str, Estimate]]]:
+    """Return the effects that delays show, each with a sentence and its parameters."""
+    out: list[tuple[Effect, str, dict[str, Estimate]]] = []
+    # events of one group of pixels differ from another's by chance
+    (late, slope), groups = delays.line(), delays.of_groups()
+    if len(groups) < 3:
+        return out
+    lines = np.array([one.line() for one in groups])
+    errors = NINETY * lines.std(axis=0, ddof=1) / math.sqrt(len(groups))
+    if late >= settings.latency:
+        half = math.hypot(float(errors[0]), settings.known * late)
+        sentence = f"events come {format_seconds(late)} after the frame that makes them, in bright light, too"
+        mine = {"latency.delay": Estimate(late, late - half, late + half)}
+        out.append((Latency(delay=late, light=0.0), sentence, mine))
+    early = _early_half(delays)
+    if early[0] >= settings.jitter and early.max() <= settings.even * early.min():
+        jitter = float(early.mean())
+        apart = np.array([_early_half(one).mean() for one in groups])
+        half = math.hypot(NINETY * float(apart.std(ddof=1)) / math.sqrt(len(groups)), settings.known * jitter)
+        sentence = f"events of the same frame and the same way to go come {format_seconds(jitter)} apart"
+        mine = {"timestamp.jitter": Estimate(jitter, jitter - half, jitter + half)}
+        out.append((Timestamp(jitter=jitter, step=0.0), sentence, mine))
+    cutoff = 1 / (2 * math.pi * max(slope, 1e-9))
+    if cutoff <= settings.cutoff and slope_in_errors(delays) >= settings.errors:
+        ends = [1 / (2 * math.pi * (slope + sign * float(errors[1]))) for sign in (1, -1)]
+        sentence = "events come the later the more of its way a pixel has to go, and the darker it is"
+        mine = {"bandwidth.cutoff": Estimate(cutoff, ends[0], ends[1])}
+        out.append((Bandwidth(cutoff=cutoff), sentence, mine))
+    return out
+
+
+def _early_half(delays: DelaysAfterFrames, bins: int = 4) -> np.ndarray:
+    """Return how far the early events of a bin of short ways lie before its median [s], shape (B,)."""
+    _, late = delays.quantiles((0.16, 0.5))
+    half: np.ndarray = late[:bins, 1] - late[:bins, 0]
+    return half
+
+
+def _with_certain(found: Diagnosis, effect: Effect, sentence: str, mine: Mapping[str, Estimate]) -> Diagnosis:
+    """Return a diagnosis in which an effect is certain, of the size that was read off."""
+    name = effect.name
+    before = next((one for one in found.findings if one.effect == name), None)
+    now = Finding(name, Grade.CERTAIN, seen=sentence, parameters=dict(mine))
+    if before is not None:
+        now = replace(now, error_without=before.error_without, error_with=before.error_with)
+    sensor, selected, errors = found.sensor, found.selected, found.errors
+    if name in sensor:
+        read = {key.partition(".")[2]: one.value for key, one in mine.items()}
+        effect = replace(sensor[name], **read)
+    else:
+        selected, errors = (*selected, name), (*errors, errors[-1])
+    others = (one for one in found.findings if one.effect != name)
+    return replace(
+        found,
+        sensor=sensor.with_effect(effect),
+        selected=selected,
+        errors=errors,
+        parameters={**found.parameters, **mine},
+        findings=(*others, now),
+        not_seen=tuple(one for one in found.not_seen if one.effect != name),
+    )

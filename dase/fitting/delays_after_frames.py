@@ -1,0 +1,174 @@
+"""How long after a held frame events come, by how much of the way to its light a pixel has to go.
+
+A simulator that holds frames knows when light jumps, so its events tell directly how late a pixel is: at once
+where it must go a small part of the way in bright light, and later behind a low-pass, by ln(1 / (1 - part))
+times its time constant. What is left without any way is the latency, and by how much that differs from event
+to event the error of the stamps. Light that goes straight from frame to frame shows nothing of the kind: its
+events come at all times.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dase.events import Events
+from dase.fitting.held_events import HeldEvents
+from dase.scenes.video import VideoScene
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class DelaySettings:
+    """Which events are looked at.
+
+    Chosen on sets y, z and k to s of other simulators: the width of the 15 clips of IEBCS that send at their
+    own times is 0.01 to 0.20, that of all others 0.28 and more but for stamps at parts of a frame.
+    """
+
+    least: int = 2_000
+    """Events below which nothing is said."""
+
+    change: float = 0.02
+    """Of the logarithm from frame to frame, at least: less is a step of 8 bits."""
+
+    beyond: float = 0.3
+    """How far the part of the way may lie outside 0 to 1; what is farther is noise."""
+
+    parts: tuple[float, float] = (0.02, 0.95)
+    """Of the way, that are told apart."""
+
+    edges: tuple[float, ...] = (0.02, 0.05, 0.1, 0.2, 0.3, 0.5, 0.7, 0.9)
+    """Between the bins of ways, as shares of the events."""
+
+    straight: int = 6
+    """Such bins whose delays grow with the way: after longer ones a pixel is not yet at rest."""
+
+    blocks: int = 8
+    """Groups of pixels whose estimates differ by chance."""
+
+    rows: int = 8
+    """Rows beside each other that are of one group."""
+
+
+DELAYS = DelaySettings()
+
+
+@dataclass(frozen=True, eq=False)
+class DelaysAfterFrames:
+    """Delays of events after held frames.
+
+    Args:
+        way: ln(1 / (1 - part of the way to the new light)) / intensity, shape (N,).
+        late: Time after the frame [s], shape (N,).
+        level: Log intensity of the new light, shape (N,).
+        gap: Time from frame to frame [s].
+        group: Of the pixel, shape (N,): groups differ by chance.
+    """
+
+    way: Array
+    late: Array
+    level: Array
+    gap: float
+    group: NDArray[np.int64]
+
+    def quantiles(self, shares: tuple[float, ...], settings: DelaySettings = DELAYS) -> tuple[Array, Array]:
+        """Return the median way, and quantiles of the delay [s], per bin of ways.
+
+        Args:
+            shares: Which quantiles.
+            settings: Between which ways bins are.
+
+        Returns:
+            Shapes (B,) and (B, len(shares)).
+        """
+        bins = np.searchsorted(np.quantile(self.way, settings.edges), self.way)
+        used = [bins == n for n in range(len(settings.edges) + 1)]
+        used = [one for one in used if one.sum() >= 20]
+        ways = np.array([np.median(self.way[one]) for one in used])
+        return ways, np.array([np.quantile(self.late[one], shares) for one in used])
+
+    def width(self, share: float = 0.68, part: float = 0.1) -> float:
+        """Return in which share of the time from frame to frame most events with the shortest way come.
+
+        Args:
+            share: Of the events.
+            part: Of the events that have the shortest way.
+        """
+        short = self.way <= np.quantile(self.way, part)
+        phase = np.sort(self.late[short] / self.gap % 1.0)
+        many = int(share * len(phase))
+        around = np.concatenate([phase, phase + 1])
+        return float(np.min(around[many : many + len(phase)] - phase))
+
+    def line(self, settings: DelaySettings = DELAYS) -> tuple[float, float]:
+        """Return the delay without any way [s], and by how much it grows with that [s]."""
+        ways, late = self.quantiles((0.5,), settings)
+        slope, begin = np.polyfit(ways[: settings.straight], late[: settings.straight, 0], 1)
+        return float(begin), float(slope)
+
+    def brighter_half(self) -> DelaysAfterFrames:
+        """Return those in brighter light, where pixels are at rest when they take their memory."""
+        return self._select(self.level > np.median(self.level))
+
+    def of_groups(self, settings: DelaySettings = DELAYS) -> list[DelaysAfterFrames]:
+        """Return the delays of each group of pixels that has enough of them."""
+        least = settings.least / settings.blocks
+        groups = (self.group == one for one in np.unique(self.group))
+        return [self._select(mine) for mine in groups if mine.sum() >= least]
+
+    def _select(self, used: NDArray[np.bool_]) -> DelaysAfterFrames:
+        return DelaysAfterFrames(
+            self.way[used], self.late[used], self.level[used], self.gap, self.group[used]
+        )
+
+
+def delays_after_frames(
+    events: Events, scene: VideoScene, settings: DelaySettings = DELAYS
+) -> DelaysAfterFrames | None:
+    """Return the delays of the first events of pixels after frames, each held from the one before on.
+
+    Args:
+        events: In order of time.
+        scene: A clip, held or as its frames are written down.
+        settings: Which events are looked at.
+
+    Returns:
+        None where there are too few.
+    """
+    seen = HeldEvents.of(events, scene)
+    first = np.flatnonzero(seen.is_first)
+    frame, pixel, sign = (one[first] for one in (seen.frame, seen.pixel, seen.sign))
+    now = seen.level[frame + 1, pixel]
+    step = sign * (now - seen.level[frame, pixel])
+    # a pixel that has sent goes on from the light of that frame
+    whole = sign * (now - seen.level[seen.before[first] + 1, pixel])
+    ways, chosen = [], []
+    for one in (1.0, -1.0):
+        used = np.flatnonzero((sign == one) & (step > settings.change))
+        if len(used) < settings.least // 4:
+            continue
+        threshold = float(np.median(whole[used] - 0.5 * step[used]))
+        part = (threshold - (whole[used] - step[used])) / step[used]
+        inside = (part > -settings.beyond) & (part < 1 + settings.beyond)
+        used, part = used[inside], np.clip(part[inside], *settings.parts)
+        ways.append(-np.log(1 - part) / np.exp(now[used]))
+        chosen.append(used)
+    if sum(map(len, chosen)) < settings.least:
+        return None
+    used = np.concatenate(chosen)
+    group = seen.row[first[used]] // settings.rows % settings.blocks
+    return DelaysAfterFrames(np.concatenate(ways), seen.late[first[used]], now[used], seen.gap, group)
+
+
+def slope_in_errors(delays: DelaysAfterFrames) -> float:
+    """Return by how many standard errors delays grow with the way."""
+    groups = delays.of_groups()
+    if len(groups) < 3:
+        return 0.0
+    slopes = np.array([one.line()[1] for one in groups])
+    return float(slopes.mean() / max(slopes.std(ddof=1) / math.sqrt(len(slopes)), 1e-12))

@@ -1,0 +1,73 @@
+"""What each event of a held clip tells is certain, however little of the error it is."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from helpers.brief_diagnosis import NO_LIMITS
+from helpers.frame_simulator import shaken_texture
+from helpers.held_pixels import held_with_low_pass
+
+import dase
+from dase.effects import EFFECTS
+from dase.results import Diagnosis, Grade
+from dase.scenes.video import VideoScene
+
+TRIED = {
+    name: EFFECTS[name]
+    for name in ("bandwidth", "latency", "jitter", "timestamp", "mismatch", "voltage_noise")
+}
+
+
+@pytest.fixture(scope="module")
+def scene() -> VideoScene:
+    return shaken_texture(gap=2e-3)
+
+
+def diagnosed(events: dase.Events, scene: VideoScene) -> Diagnosis:
+    return dase.diagnose(events, scene=scene, effects=TRIED, most=1, pixels=200, settings=NO_LIMITS)
+
+
+@pytest.mark.slow
+def test_latency_stamps_and_jitter_are_certain(scene):
+    events = held_with_low_pass(scene, cutoff=4e4, late=0.4e-3, stamps=0.06e-3, spread=0.15)
+    found = diagnosed(events, scene)
+    assert {one.effect: one.grade for one in found.findings} == {
+        "jitter": Grade.CERTAIN, "latency": Grade.CERTAIN, "timestamp": Grade.CERTAIN,
+    }  # fmt: skip
+    truth = {"latency.delay": 0.4e-3, "timestamp.jitter": 0.06e-3, "jitter.spread": 0.15}
+    for name, value in truth.items():
+        assert found.parameters[name].value == pytest.approx(value, rel=0.1)
+    assert len(found.errors) == len(found.selected) + 1
+
+
+@pytest.mark.slow
+def test_a_habit_of_the_simulator_is_in_the_model_and_no_finding(scene):
+    """Thresholds that differ by 3 % were taken for a noise of the voltage."""
+    events = held_with_low_pass(scene, cutoff=4e4, late=0.1e-3, stamps=0.01e-3, spread=0.03)
+    found = diagnosed(events, scene)
+    assert found.findings == ()
+    assert found.errors[-1] < 0.5
+    assert any("from event to event" in note for note in found.notes)
+    assert found.parameters["threshold.on"].value == pytest.approx(0.2, rel=0.01)
+
+
+@pytest.mark.slow
+def test_pixels_of_a_slow_scene_have_the_frame_for_their_memory():
+    """No pixel asks for more than an event in several frames: that is no dead time of several frames."""
+    scene = shaken_texture(gap=0.5e-3, length=0.4)
+    slow = VideoScene(scene.frames(scene.sample_times()), 4 * scene.sample_times())
+    found = diagnosed(held_with_low_pass(slow, spread=0.02), slow)
+    assert found.findings == ()
+    assert found.errors[-1] < 0.5
+
+
+def test_latency_of_more_than_a_frame_is_left_to_the_search(scene):
+    """After which frame an event is late its delay does not tell."""
+    gap = float(np.diff(scene.sample_times())[0])
+    events = held_with_low_pass(scene, late=1.3 * gap)
+    found = diagnosed(events, scene)
+    assert not [
+        one for one in found.findings
+        if one.effect == "latency" and one.parameters["latency.delay"].value < gap
+    ]  # fmt: skip
