@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
-from scipy.ndimage import maximum_filter1d, median_filter
+from scipy.ndimage import maximum_filter1d, median_filter, uniform_filter1d
 
 from dase.formatting import format_percent, format_seconds
 from dase.signatures.chance import mean_interval
@@ -32,6 +32,7 @@ class CouplingSettings:
     fewest_frames: int = 7  # with less not even the same moment in each frame is significant
     fewest_events: float = 50.0  # per frame interval and polarity
     usual: float = 0.02  # [s] its median is the usual rate: longer than a burst, shorter than a scene
+    even: float = 0.002  # [s] over which that rate is taken
     shortest: float = 0.014  # [s] what repeats sooner is a lamp: it has 100 or 120 cycles per second
     windows: tuple[float, ...] = (0.03, 0.06, 0.12)  # of a period, in which bursts in step with frames come
     periods: int = 24  # that lie between most pairs of bursts are tried
@@ -96,7 +97,9 @@ class _Folded:
 
 
 def _usual_rate(counts: NDArray[np.float64], step: float, settings: CouplingSettings) -> NDArray[np.float64]:
-    out: NDArray[np.float64] = median_filter(counts, 2 * round(settings.usual / step / 2) + 1, mode="nearest")
+    # a simulator's events may come at every other step alone
+    even = uniform_filter1d(counts, max(round(settings.even / step), 1), mode="nearest")
+    out: NDArray[np.float64] = median_filter(even, 2 * round(settings.usual / step / 2) + 1, mode="nearest")
     return out
 
 

@@ -144,6 +144,18 @@ def test_bursts_with_the_frames_show_and_tell_their_times(plain, framed):
     assert set(entry.details["phases"]) == {"ON", "OFF"}
 
 
+@pytest.mark.parametrize("step", [1e-3, 1.6e-3])
+def test_bursts_show_beside_events_of_a_simulator_at_its_own_steps(plain, step):
+    """Most half milliseconds are empty: with their median for the usual rate all was a burst, or a lamp."""
+    events = bursts(plain)
+    t = step * np.floor(events.t / step)
+    looked = dase.find_signatures(replace(events, t=t))
+    assert looked["frame coupling"].found
+    assert looked["frame coupling"].details["interval"] == pytest.approx(experiment.GAP, rel=5e-3)
+    of_none = dase.find_signatures(replace(plain, t=step * np.floor(plain.t / step)))["frame coupling"]
+    assert of_none.answer is Answer.NOT_SEEN
+
+
 def test_few_bursts_that_all_keep_step_are_enough():
     """Fourteen of each polarity, where a statistic of their phases alone needs some twenty."""
     coupling = {"amplitude": 0.25, "spread": 0.3, "period": 0.05, "exposure": 0.0055, "begin": 0.01}
