@@ -12,6 +12,7 @@ from dataclasses import replace
 from dase.diagnosis.cell_descriptions import worst_cells
 from dase.diagnosis.detection_limits import find_detection_limits
 from dase.diagnosis.grading import ModelOnReport, grade_effects, is_far_off, judge_on_report, leaves_little
+from dase.diagnosis.late_within_frames import doubt_delays_within_frames
 from dase.diagnosis.ranking import values_of
 from dase.diagnosis.remainder import describe_unexplained, share_of_scene, what_to_record
 from dase.diagnosis.seen_effects import SeenEffects, part_to_simulate, without_the_explained
@@ -66,6 +67,7 @@ def conclude_diagnosis(
         judged_effects = grade_effects(
             task, path, model, order, way, first, last, report=report, values=values, at_bounds=at_bounds
         )
+        judged_effects = doubt_delays_within_frames(judged_effects, model.sensor, measurement.scene)
     explained = model.sensor
     for name, one in judged_effects.items():
         # a stand-in explains nothing that the events show

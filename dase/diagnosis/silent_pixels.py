@@ -59,9 +59,10 @@ class SilentPixelSettings:
     hardly: int = 3
     """Events of a pixel that sends hardly anything, at most."""
 
-    apart: float = 3.0
+    apart: float = 2.0
     """Silent pixels, as times those that send hardly anything: 157 to 269 dead ones had one of these beside
-    them at most, 12 that a slow second pole had silenced had ten."""
+    them at most, 61 beside bursts that differ from pixel to pixel had 21, 12 that a slow second pole had
+    silenced had ten."""
 
     repeats: int = 4
     """Of a model that is asked whether a pixel may be silent: its memory begins anywhere."""

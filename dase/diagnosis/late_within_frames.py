@@ -1,0 +1,53 @@
+"""Delays within the frames of a clip, beside a scan of the rows.
+
+A simulator that knows frames alone sends the events of one at its end, or evenly in it, up to a frame late.
+That shows in the times of its events (`dase.fitting.frame_steps`), unless a scan of the rows has moved them:
+then it looks like a latency or a low-pass.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+
+from dase.effects import Effect
+from dase.effects.bandwidth import Bandwidth
+from dase.effects.latency import Latency
+from dase.effects.row_scan import RowScan
+from dase.effects.second_order import SecondOrder
+from dase.fitting.frame_steps import clip_step_of
+from dase.results import Finding, Grade
+from dase.scenes.scene import Scene
+from dase.simulation.sensor import Sensor
+
+
+def doubt_delays_within_frames(
+    findings: Mapping[str, Finding], sensor: Sensor, scene: Scene
+) -> dict[str, Finding]:
+    """Return findings in which delays shorter than a frame may be something unknown, where rows are scanned.
+
+    Args:
+        findings: Effect to what the search says of it.
+        sensor: The last model.
+        scene: The light.
+    """
+    gap = clip_step_of(scene)
+    if not gap or not any(isinstance(one, RowScan) for one in sensor.effects):
+        return dict(findings)
+    late = {one.name: _delay_of(one) for one in sensor.effects}
+    return {
+        name: replace(one, grade=Grade.EITHER, unknown=True)
+        if one.grade is Grade.SUPPORTED and 0 < late.get(name, 0.0) < gap
+        else one
+        for name, one in findings.items()
+    }
+
+
+def _delay_of(effect: Effect) -> float:
+    """Return about how late an effect makes events in bright light [s]; 0 of others."""
+    if isinstance(effect, Latency):
+        return effect.delay
+    if isinstance(effect, Bandwidth):
+        return 1 / (2 * math.pi * effect.cutoff)
+    return 2 * effect.damping / (2 * math.pi * effect.cutoff) if isinstance(effect, SecondOrder) else 0.0

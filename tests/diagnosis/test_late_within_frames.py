@@ -1,0 +1,44 @@
+"""What is late by less than a frame of a clip may be a simulator's habit where a scan hides it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from dase.diagnosis.late_within_frames import doubt_delays_within_frames
+from dase.effects import EFFECTS
+from dase.results import Finding, Grade
+from dase.scenes.video import VideoScene
+from dase.simulation.sensor import Sensor
+
+SCAN = {"row_scan": EFFECTS["row_scan"](line=1e-6)}
+
+
+def graded(gap: float, grade: Grade = Grade.SUPPORTED, **effects) -> Grade:
+    """Return the grade of the first of some effects, found in a clip with frames so far apart [s]."""
+    scene = VideoScene(np.zeros((5, 4, 6), np.uint8), gap * np.arange(5))
+    sensor = Sensor()
+    for one in effects.values():
+        sensor = sensor.with_effect(one)
+    name = next(iter(effects))
+    return doubt_delays_within_frames({name: Finding(name, grade)}, sensor, scene)[name].grade
+
+
+@pytest.mark.parametrize(
+    ("name", "values"),
+    [
+        ("latency", {"delay": 1e-3}),
+        ("bandwidth", {"cutoff": 159.0}),
+        ("second_order", {"cutoff": 200.0, "damping": 0.7}),
+    ],
+)
+def test_delays_within_a_frame_are_doubted_beside_a_scan(name, values):
+    late = {name: EFFECTS[name](**values)}
+    assert graded(2e-3, **late, **SCAN) is Grade.EITHER
+    assert graded(0.5e-3, **late, **SCAN) is Grade.SUPPORTED
+    assert graded(2e-3, **late) is Grade.SUPPORTED
+    assert graded(2e-3, Grade.CERTAIN, **late, **SCAN) is Grade.CERTAIN
+
+
+def test_what_makes_nothing_late_is_not_doubted():
+    assert graded(2e-3, leak=EFFECTS["leak"](rate=1.0), **SCAN) is Grade.SUPPORTED
