@@ -14,6 +14,7 @@ from dase.diagnosis.dead_time import add_dead_time, find_dead_time
 from dase.diagnosis.drifting_memory import EFFECT as LEAKING
 from dase.diagnosis.drifting_memory import find_drifting_memory
 from dase.diagnosis.events_at_rest import find_events_at_rest, noise_is_a_pattern
+from dase.diagnosis.late_light import find_late_events
 from dase.diagnosis.light_between_events import LightBetweenEvents
 from dase.diagnosis.redrawn_thresholds import EFFECT as JITTER
 from dase.diagnosis.redrawn_thresholds import find_jitter_beside
@@ -21,6 +22,8 @@ from dase.diagnosis.seen_effects import SeenEffects
 from dase.diagnosis.state import DiagnosisState, DiagnosisTask, EventsAlone, with_same_freedom
 from dase.diagnosis.unequal_thresholds import EFFECT as MISMATCH
 from dase.diagnosis.unequal_thresholds import find_unequal_thresholds
+from dase.effects import EFFECTS
+from dase.effects.made_signatures import makers_of
 from dase.effects.threshold import Threshold
 from dase.fitting.measurement import Measurement
 from dase.fitting.model import FittedModel
@@ -29,6 +32,8 @@ from dase.results import is_worse
 from dase.signatures.kinds import (
     DEAD_TIME,
     FIXED_PATTERN,
+    FULL_BUS,
+    LATE_EVENTS,
     LEAK_EVENTS,
     NOISE_AT_REST,
     UNEQUAL_THRESHOLDS,
@@ -51,6 +56,7 @@ def look_beside_model(
     seen = _look_where_light_rests(task, seen, measurement, model)
     seen = _look_for_dead_time(task, seen, measurement, model)
     seen = _look_at_thresholds(task, seen, measurement, model)
+    seen = _look_for_late_events(task, seen, measurement, model)
     seen = _without_pattern_of_noise(state, seen, measurement, model)
     certain = frozenset(seen.effects) & frozenset(task.effects) - task.given
     noise = seen.entry_of(NOISE_AT_REST)
@@ -166,6 +172,19 @@ def _look_at_thresholds(
         structure = task.evidence.structure
         found.append(find_drifting_memory(light, model.sensor, structure=structure, seed=task.seed))
     return replace(seen, entries=(*seen.entries, *(one for one in found if one is not None)))
+
+
+def _look_for_late_events(
+    task: DiagnosisTask, seen: SeenEffects, measurement: Measurement, model: FittedModel
+) -> SeenEffects:
+    """Return what is seen, with the ways in which events are late."""
+    known = makers_of(LATE_EVENTS, {**EFFECTS, **task.effects})
+    # a bus makes events late, too, and a lamp and bursts make some that light does not
+    hidden = seen.lamp or seen.bursts is not None or seen.entry_of(FULL_BUS) is not None
+    if task.evidence.contradiction or hidden or task.given.intersection(known):
+        return seen
+    found = find_late_events(measurement, log_eps=model.sensor.log_eps)
+    return replace(seen, entries=(*seen.entries, *found))
 
 
 def _without_pattern_of_noise(

@@ -38,6 +38,7 @@ from dase.signatures.kinds import (
     FRAME_COUPLING,
     HOT_PIXELS,
     KINDS,
+    LATE_EVENTS,
     NOISE_AT_REST,
     OPPOSITE_PAIRS,
     TIME_STAMPS,
@@ -133,7 +134,9 @@ class SeenEffects:
         named = {one.effect for one in out if one.grade in (Grade.CERTAIN, Grade.SUPPORTED)}
         unsaid = {name for name in named if name in self.library and self.library[name].signatures is None}
         for entry in self.entries:
-            makers = makers_of(entry.name, self._known).keys()
+            makers = set(makers_of(entry.name, self._known))
+            if entry.name == LATE_EVENTS:  # that one way is named says nothing of another
+                makers = set(self.named_by(entry))
             if makers & named or makers & set(given):
                 continue
             if KINDS[entry.name].beside_model and unsaid:
@@ -180,17 +183,18 @@ class SeenEffects:
 
     @property
     def _contradicted(self) -> frozenset[str]:
-        """Noise of pixels at rest whose events are not so one by one; effects that would have been seen."""
+        """Noise and delays of which events one by one tell other ones; effects that would have been seen."""
         out = set[str]()
         for entry in self.entries:
-            if entry.name == NOISE_AT_REST and told_by(entry, self._known):
+            if entry.name in (NOISE_AT_REST, LATE_EVENTS) and told_by(entry, self._known):
                 makers = makers_of(entry.name, self._known).items()
                 out |= {name for name, one in makers if one.by and not one.is_told_by(entry)}
         for entry in self.absent:
             if KINDS[entry.name].denies:
                 makers = makers_of(entry.name, self._known).items()
                 out |= {name for name, one in makers if one.is_denied_by_absence}
-        return frozenset(out)
+        # a pole is seen beside a latency
+        return frozenset(out) - set(self.effects)
 
     def _with_either(self, entry: Signature, findings: Sequence[Finding]) -> list[Finding]:
         """Return findings with one of several effects that is there, and that the search has not announced.

@@ -10,6 +10,7 @@ from typing import ClassVar, Self
 import warp as wp
 
 from dase.effects.base import ANY_SAMPLES, Effect, Observations, choice, parameter
+from dase.effects.made_signatures import Makes
 from dase.effects.photocurrent import dark_share, idle_beside, relative_photocurrent
 from dase.kernels.pixel_stages import EffectStages
 from dase.kernels.vector_math import exponential, logarithm
@@ -135,7 +136,7 @@ class Bandwidth(Effect):
     )
     stages: ClassVar = {"respond": lowpass_voltage}
     states: ClassVar = ("input", "output")
-    signatures: ClassVar = ()
+    signatures: ClassVar = (Makes("late events", tells=True, by="pole", absence=False),)
     screen_limits: ClassVar = {
         "cutoff": (
             "a cutoff above about {highest_cutoff:g} Hz wants an LED, as a screen of {refresh:g} Hz needs "

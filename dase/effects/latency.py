@@ -9,6 +9,7 @@ from typing import ClassVar
 import warp as wp
 
 from dase.effects.base import Effect, parameter
+from dase.effects.made_signatures import Makes
 from dase.effects.photocurrent import dark_share, idle_beside, relative_photocurrent
 
 
@@ -40,7 +41,7 @@ class Latency(Effect):
         "temporal contrast vision sensor, 2008 (latency over illumination)"
     )
     stages: ClassVar = {"delay": event_delay}
-    signatures: ClassVar = ()
+    signatures: ClassVar = (Makes("late events", tells=True, by="delay", absence=False),)
     screen_limits: ClassVar = {
         "": (
             "the delay is not told by a screen: its own lag cannot be known apart; an LED beside a trigger "

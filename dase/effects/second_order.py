@@ -11,6 +11,7 @@ import warp as wp
 
 from dase.effects.bandwidth import Bandwidth, time_constants
 from dase.effects.base import ANY_SAMPLES, Effect, Observations, choice, parameter
+from dase.effects.made_signatures import Makes
 from dase.effects.photocurrent import USUAL, dark_share, idle_beside, relative_photocurrent
 from dase.kernels.pixel_stages import EffectStages
 from dase.kernels.vector_math import cosine_and_sine, exponential
@@ -206,7 +207,7 @@ class SecondOrder(Effect):
     stages: ClassVar = {"respond": second_order_voltage}
     states: ClassVar = ("input", "output", "slope")
     includes: ClassVar = ("bandwidth",)
-    signatures: ClassVar = ()
+    signatures: ClassVar = (Makes("late events", tells=True, by="poles", absence=False),)
     screen_limits: ClassVar = {
         "": (
             "a cutoff above about {highest_cutoff:g} Hz and the damping want an LED, as the screen rings and "

@@ -22,6 +22,7 @@ NOISE_AT_REST = "noise at rest"
 UNEQUAL_THRESHOLDS = "unequal thresholds"
 DRIFTING_MEMORY = "drifting memory"
 REDRAWN_THRESHOLDS = "redrawn thresholds"
+LATE_EVENTS = "late events"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,7 +34,8 @@ class SignatureKind:
         about: What events do, in a line.
         ways: Details that only some of these signatures have, by which they tell effects apart: of time
             stamps the time between ticks or that of a line [s], of noise the share of successive events that
-            are opposite, where these are independent or return.
+            are opposite, where these are independent or return, of late events by how much they are, or the
+            poles that light is behind.
         beside_model: Whether it is what a model over the same scene lacks: events alone do not show it.
         whatever_fits: Whether it is there however badly that model fits.
         of_light: Whether light makes it by itself: a scene may show it to any sensor, and an effect that
@@ -106,6 +108,12 @@ KINDS: dict[str, SignatureKind] = {
         SignatureKind(
             name=REDRAWN_THRESHOLDS,
             about="how far light goes between two events differs each time",
+            beside_model=True,
+        ),
+        SignatureKind(
+            name=LATE_EVENTS,
+            about="light goes equally far between two events some time before these, or behind poles",
+            ways=("delay", "pole", "poles"),
             beside_model=True,
         ),
     )

@@ -1,0 +1,305 @@
+"""Whether events are late, and in which way: by how far light goes from one event of a pixel to the next.
+
+That is the threshold each time, of the light that the pixel sees when it decides. If events come later by a
+fixed time, or light is behind a pole or two, it is so of that light and not of the scene's. So the light is
+taken back by a latency, a pole, two poles and both, and the way and the values are sought with which light
+goes equally far. No model is fitted: thresholds may be any, noise and leaks add the same to all, and
+hundreds of thousands of steps tell ways apart that statistics do not.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize
+
+from dase.diagnosis.light_between_events import LightBetweenEvents, StepSettings
+from dase.fitting.frame_steps import is_held
+from dase.fitting.measurement import Measurement
+from dase.formatting import format_metric, format_percent, format_seconds
+from dase.signatures.kinds import LATE_EVENTS
+from dase.signatures.result import Answer, Signature
+
+Array = NDArray[np.float64]
+Levels = NDArray[np.float32]
+
+
+LOOKED_AT = StepSettings(samples=4_000_000, events=200_000)
+"""Pixels, instants and events."""
+
+
+@dataclass(frozen=True)
+class LateLightSettings:
+    """When events are late.
+
+    Chosen on sets k to z of other simulators (development): with latencies and poles steps differed by 0.01
+    to 0.68 of what they did without, with none by 0.88 and more.
+    """
+
+    quick: tuple[tuple[float, ...], tuple[float, ...]] = ((1e-3, 3e-3, 8e-3), (20.0, 80.0))
+    """Latencies [s] and poles [Hz] that are looked at first."""
+
+    begun: float = 0.93
+    """Share of what steps differ by that they do with the best of these, at most, for others to be sought."""
+
+    delays: tuple[float, float, int] = (3e-4, 2.4e-2, 10)
+    """Latencies from which on they are sought: from, to [s], and how many."""
+
+    poles: tuple[float, float, int] = (6.0, 800.0, 8)
+    """The same of poles [Hz]."""
+
+    darks: tuple[float, ...] = (0.03, 0.3)
+    """Currents without light beside which these are."""
+
+    most_dark: float = 30.0
+    """Such a current, at most: poles then hang on the light no more."""
+
+    soonest: float = 5e-4
+    """Latency that is told, at least [s]: a bus makes events late by less."""
+
+    fastest: float = 400.0
+    """Pole that is told, at most [Hz]."""
+
+    alike: float = 0.7
+    """Share of what steps differ by that they do in the end, at most."""
+
+    even: float = 0.4
+    """What they then differ by, at most, relative to the threshold."""
+
+    decided: float = 1.08
+    """Times what steps differ by in the best way that they do in every simpler way, and in every other of as
+    many values, at least, for it to be told."""
+
+    least: int = 1000
+    """Steps of a polarity, at least."""
+
+    longest: float = 0.05
+    """Time of one that counts, at most [s]: noise and leaks grow with time."""
+
+
+LATE_LIGHT = LateLightSettings()
+
+
+@dataclass(frozen=True)
+class Way:
+    """A way in which events are late.
+
+    Args:
+        differ: What steps of the light then differ by, relative to the threshold.
+        delay: Latency [s].
+        poles: Of the low-pass, at the brightest light, ascending [Hz].
+        values: How many values it has.
+    """
+
+    differ: float
+    delay: float = 0.0
+    poles: tuple[float, ...] = ()
+    values: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class _Steps:
+    """Events of the rows that are looked at, pixel by pixel, and the light there.
+
+    Args:
+        level: Log intensity, shape (T, P).
+        times: Of the instants [s], shape (T,).
+        pixel: Of each event, shape (N,).
+        t: Its time [s], shape (N,).
+        on: Whether it is ON, shape (N,).
+        darkest: Log intensity from which on events count.
+        settings: What counts.
+    """
+
+    level: Levels
+    times: Array
+    pixel: NDArray[np.int64]
+    t: Array
+    on: NDArray[np.bool_]
+    darkest: float
+    settings: LateLightSettings
+
+    @classmethod
+    def of(cls, light: LightBetweenEvents, settings: LateLightSettings) -> _Steps:
+        """Return those of a measurement."""
+        first, after = light.rows
+        events = light.measurement.compared_events()
+        events = events.select((events.y >= first) & (events.y < after))
+        pixel = (events.y.astype(np.int64) - first) * events.width + events.x
+        order = np.lexsort((events.t, pixel))
+        level = np.asarray(light.level, np.float32)
+        darkest = float(np.quantile(level, 0.99)) + math.log(light.settings.darkest)
+        on = np.asarray(events.p, bool)[order]
+        return cls(level, light.times, pixel[order], events.t[order], on, darkest, settings)
+
+    def differ(self, level: Levels, delay: float = 0.0) -> float:
+        """Return what steps differ by: half of what two thirds lie in, relative to their median.
+
+        Infinite where too few count.
+
+        Args:
+            level: The light that pixels see, shape (T, P).
+            delay: How much earlier than its event a pixel decides [s].
+        """
+        t = self.t - delay
+        at = np.clip(np.searchsorted(self.times, t, side="right") - 1, 0, len(self.times) - 2)
+        share = np.clip((t - self.times[at]) / (self.times[at + 1] - self.times[at]), 0.0, 1.0)
+        before, after = level[at, self.pixel], level[at + 1, self.pixel]
+        here = before + (after - before) * share
+        step, gap = np.diff(here), np.diff(self.t)
+        counts = (self.pixel[1:] == self.pixel[:-1]) & (self.on[1:] == self.on[:-1])
+        counts &= (gap > 0) & (gap < self.settings.longest) & (np.minimum(here[1:], here[:-1]) > self.darkest)
+        out = []
+        for on in (True, False):
+            moved = step[counts & (self.on[1:] == on)] * (1 if on else -1)
+            if len(moved) < self.settings.least:
+                continue
+            low, middle, high = np.quantile(moved, [0.16, 0.5, 0.84])
+            out.append(float(high - low) / 2 / float(middle) if middle > 0 else math.inf)
+        return float(np.mean(out)) if out else math.inf
+
+    def behind_pole(self, cutoff: float, dark: float, level: Levels | None = None) -> Levels:
+        """Return the light behind a pole that goes with it, exact where it runs straight, shape (T, P).
+
+        Args:
+            cutoff: At the brightest light [Hz].
+            dark: Current without light that adds to it, relative to the brightest.
+            level: Log intensity that it filters, shape (T, P); None for that of the scene.
+        """
+        seen = self.level if level is None else level
+        brightest = float(np.quantile(self.level, 0.99))
+        out = np.empty_like(seen)
+        now = out[0] = seen[0]
+        for n, gap in enumerate(np.diff(self.times)):
+            light = np.exp(0.5 * (self.level[n] + self.level[n + 1]) - brightest)
+            x = np.maximum((2 * np.pi * cutoff * gap / (1 + dark)) * (light + dark), 1e-6)
+            decay = np.exp(-x)
+            now = seen[n + 1] - (seen[n + 1] - seen[n]) * ((1 - decay) / x) + (now - seen[n]) * decay
+            out[n + 1] = now
+        return out
+
+
+def find_late_events(
+    measurement: Measurement, *, log_eps: float, settings: LateLightSettings = LATE_LIGHT
+) -> tuple[Signature, ...]:
+    """Return in which ways events are late, each with its size; none where they are not, or that is not told.
+
+    Args:
+        measurement: Its light is known, and not held.
+        log_eps: Added to intensities before the logarithm.
+        settings: When they are late.
+    """
+    if is_held(measurement.scene):
+        return ()
+    light = LightBetweenEvents.of(measurement, log_eps=log_eps, settings=LOOKED_AT)
+    if light is None:
+        return ()
+    steps = _Steps.of(light, settings)
+    at_once = steps.differ(steps.level)
+    if not math.isfinite(at_once) or not _looks_late(steps, at_once, settings):
+        return ()
+    ways = _ways_of(steps, settings)
+    best = min(ways, key=lambda one: one.differ)
+    near = [one for one in ways if one.differ < settings.decided * best.differ]
+    if best.differ > min(settings.alike * at_once, settings.even):
+        return ()
+    if 0 < best.delay < settings.soonest or any(one > settings.fastest for one in best.poles[:1]):
+        return ()
+    if any(one is not best and one.values <= best.values for one in near):
+        return ()  # a search tells more, or names both
+    return _signatures_of(best, at_once)
+
+
+def _looks_late(steps: _Steps, at_once: float, settings: LateLightSettings) -> bool:
+    """Return whether some latency or pole makes steps more alike."""
+    delays, poles = settings.quick
+    looks = [steps.differ(steps.level, delay) for delay in delays]
+    looks += [steps.differ(steps.behind_pole(pole, settings.darks[-1])) for pole in poles]
+    return min(looks) < settings.begun * at_once
+
+
+def _ways_of(steps: _Steps, settings: LateLightSettings) -> list[Way]:
+    """Return the best latency, pole, two poles, and pole with a latency."""
+
+    def dark_of(log: float) -> float:
+        return min(math.exp(log), settings.most_dark)
+
+    low, high, count = settings.delays
+    begin = min(np.geomspace(low, high, count), key=lambda delay: steps.differ(steps.level, delay))
+    differ, logs = _least(lambda q: steps.differ(steps.level, math.exp(q[0])), [math.log(begin)], [0.15], 12)
+    latency = Way(differ, delay=math.exp(logs[0]), values=1)
+
+    def pole(logs: Sequence[float]) -> float:
+        return steps.differ(steps.behind_pole(math.exp(logs[0]), dark_of(logs[1])))
+
+    low, high, count = settings.poles
+    starts = [(math.log(f), math.log(d)) for f in np.geomspace(low, high, count) for d in settings.darks]
+    differ, logs = _least(pole, min(starts, key=pole), [0.25, 0.8], 22)
+    slow = math.exp(logs[0])
+    one = Way(differ, poles=(slow,), values=2)
+
+    def poles(logs: Sequence[float]) -> float:
+        dark, first, apart = dark_of(logs[2]), math.exp(logs[0]), math.exp(abs(logs[1]))
+        return steps.differ(steps.behind_pole(first * apart, dark, steps.behind_pole(first, dark)))
+
+    differ, both = _least(poles, [logs[0] + 0.5, 0.3, logs[1]], [0.25, 0.3, 0.8], 32)
+    ends = (math.exp(both[0]), math.exp(both[0] + abs(both[1])))
+    two = Way(differ, poles=ends, values=3)
+
+    def late_pole(logs: Sequence[float]) -> float:
+        return steps.differ(steps.behind_pole(math.exp(logs[0]), dark_of(logs[2])), math.exp(logs[1]))
+
+    lag = math.log(0.3 / (2 * math.pi * slow))
+    differ, both = _least(late_pole, [logs[0] + 0.4, lag, logs[1]], [0.25, 0.6, 0.8], 32)
+    return [latency, one, two, Way(differ, math.exp(both[1]), (math.exp(both[0]),), values=3)]
+
+
+def _least(
+    differ: Callable[[Sequence[float]], float], begin: Sequence[float], steps: Sequence[float], looks: int
+) -> tuple[float, list[float]]:
+    """Return the least of a function near a place, and where it is.
+
+    Args:
+        differ: The function.
+        begin: Where the search begins.
+        steps: How far it looks to begin with, in each direction.
+        looks: Values that are taken, about.
+    """
+    corners = np.tile(np.asarray(begin, float), (len(begin) + 1, 1))
+    corners[1:] += np.diag(steps)
+    found = minimize(
+        differ, corners[0], method="Nelder-Mead", options={"maxfev": looks, "initial_simplex": corners}
+    )
+    return float(found.fun), [float(one) for one in found.x]
+
+
+def _signatures_of(way: Way, at_once: float) -> tuple[Signature, ...]:
+    """Return what a way shows: a latency, a pole or two, or a pole and a latency.
+
+    Args:
+        way: The best.
+        at_once: What steps of the scene's light differ by, relative to the threshold.
+    """
+    alike = (
+        f"from one event of a pixel to the next light then goes as far to within "
+        f"{format_percent(way.differ)}, and to within {format_percent(at_once)} at once"
+    )
+    said: list[tuple[str, float, str, str]] = []
+    if way.poles:
+        named = " and ".join(format_metric(one, "Hz") for one in way.poles)
+        kind = "pole" if len(way.poles) == 1 else "poles"
+        said.append((kind, way.poles[0], "Hz", f"events are of light behind {named}: {alike}"))
+    if way.delay:
+        late = f"events come {format_seconds(way.delay)} late: {alike}"
+        said.append(("delay", way.delay, "s", late))
+    return tuple(
+        Signature(
+            name=LATE_EVENTS, answer=Answer.FOUND, p=0.0, size=size, unit=unit, sentence=sentence,
+            details={kind: size},
+        )
+        for kind, size, unit, sentence in said
+    )  # fmt: skip

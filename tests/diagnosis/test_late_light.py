@@ -1,0 +1,106 @@
+"""A latency, poles and both are told by how far light goes from event to event, with their values."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from helpers.frame_simulator import HEIGHT, WIDTH, shaken_texture
+
+from dase.diagnosis.late_light import find_late_events
+from dase.events import Events
+from dase.fitting.measurement import Measurement
+from dase.scenes.video import VideoScene
+
+FINE = 20
+"""Steps from frame to frame of the reference, which takes small ones where the code is exact."""
+
+
+def late_events(
+    scene: VideoScene,
+    *,
+    delay: float = 0.0,
+    poles: tuple[float, ...] = (),
+    spread: float = 0.02,
+    seed: int = 0,
+) -> Events:
+    """Return the events of pixels that see light late, step by small step.
+
+    Args:
+        scene: Frames of light; its logarithm runs straight between them.
+        delay: From the crossing to the event [s].
+        poles: Of a low-pass, at full light and as much lower as light is, with a tenth of full light [Hz].
+        spread: By which thresholds of 0.2 differ from event to event, relative.
+    """
+    rng = np.random.default_rng(0)
+    times = scene.sample_times()
+    level = np.log(scene.frames(times).astype(np.float64) + 1e-3)
+    brightest = np.quantile(np.exp(level), 0.99)
+    seen = [level[0].copy() for _ in poles]
+    memory = level[0].copy()
+    last = level[0].copy()
+    threshold = 0.2 * (1 + spread * rng.standard_normal(last.shape))
+    out = []
+    for begin, end, a, b in zip(times[:-1], times[1:], level[:-1], level[1:], strict=True):
+        step = (end - begin) / FINE
+        for n in range(FINE):
+            now = a + (b - a) * (n + 1) / FINE
+            share = (np.exp(now) / brightest + 0.1) / 1.1
+            for k, cutoff in enumerate(poles):
+                seen[k] += (1 - np.exp(-2 * np.pi * cutoff * share * step)) * (now - seen[k])
+                now = seen[k].copy()
+            y, x = np.nonzero(np.abs(now - memory) >= threshold)
+            sign = np.sign(now - memory)[y, x]
+            goal = memory[y, x] + sign * threshold[y, x]
+            part = np.clip((goal - last[y, x]) / (now - last)[y, x], 0, 1)
+            out.append((begin + (n + part) * step + delay, x, y, sign > 0))
+            memory[y, x] = goal
+            threshold[y, x] = 0.2 * (1 + spread * rng.standard_normal(len(x)))
+            last = now.copy()
+    t, x, y, p = (np.concatenate(part) for part in zip(*out, strict=True))
+    order = np.argsort(t, kind="stable")
+    return Events(np.round(1e6 * t[order]) / 1e6, x[order], y[order], p[order], WIDTH, HEIGHT)
+
+
+@pytest.fixture(scope="module")
+def scene() -> VideoScene:
+    return shaken_texture(gap=2e-3, length=0.6)
+
+
+def told(scene: VideoScene, **late) -> dict[str, float]:
+    """Return what is told of events that are late, size by way."""
+    found = find_late_events(Measurement(late_events(scene, **late), scene), log_eps=1e-3)
+    return {way: size for one in found for way, size in one.details.items()}
+
+
+def test_a_latency_is_told(scene):
+    assert told(scene, delay=3e-3) == pytest.approx({"delay": 3e-3}, rel=0.03)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("cutoff", [20.0, 60.0])
+def test_a_pole_is_told(scene, cutoff):
+    assert told(scene, poles=(cutoff,)) == pytest.approx({"pole": cutoff}, rel=0.1)
+
+
+@pytest.mark.slow
+def test_two_poles_are_told(scene):
+    found = told(scene, poles=(40.0, 60.0))
+    assert set(found) == {"poles"}
+    assert 30 < found["poles"] < 55
+
+
+@pytest.mark.slow
+def test_a_pole_and_a_latency_are_told_apart(scene):
+    found = told(scene, poles=(30.0,), delay=4e-3)
+    assert found == pytest.approx({"pole": 30.0, "delay": 4e-3}, rel=0.15)
+
+
+@pytest.mark.parametrize("late", [{}, {"spread": 0.2}, {"delay": 2e-4}, {"poles": (3000.0,)}])
+def test_nothing_is_told_of_what_is_not_late(scene, late):
+    assert told(scene, **late) == {}
+
+
+def test_few_events_tell_nothing(scene):
+    events = late_events(scene, delay=3e-3)
+    few = events.select(np.arange(900))
+    assert find_late_events(Measurement(few, scene), log_eps=1e-3) == ()
