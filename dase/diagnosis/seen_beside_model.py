@@ -183,7 +183,8 @@ def _look_for_late_events(
     hidden = seen.lamp or seen.bursts is not None or seen.entry_of(FULL_BUS) is not None
     if task.evidence.contradiction or hidden or task.given.intersection(known):
         return seen
-    found = find_late_events(measurement, log_eps=model.sensor.log_eps)
+    frame_step = task.evidence.frame_step or 0.0
+    found = find_late_events(measurement, log_eps=model.sensor.log_eps, frame_step=frame_step)
     return replace(seen, entries=(*seen.entries, *found))
 
 
