@@ -217,8 +217,8 @@ def find_late_events(
     even = settings.even_in_frames if frame_step else settings.even
     if best.differ > min(settings.alike * at_once, even):
         return ()
-    # a simulator that knows frames alone is late by a part of one
-    soonest, slowest = max(settings.soonest, frame_step), min(best.poles, default=0.0)
+    # a simulator that knows frames alone is late by a frame itself
+    soonest, slowest = max(settings.soonest, 3 * frame_step), min(best.poles, default=0.0)
     if 0 < best.delay < soonest or slowest > settings.fastest:
         return ()
     if any(one is not best and one.values <= best.values for one in near):
