@@ -53,8 +53,9 @@ class SilentPixelSettings:
     """The range, in units of the neighbours' median; and the mean light, either way: an edge that rests lets
     one pixel see less than those beside it."""
 
-    least: int = 3
-    """Silent pixels that there must be."""
+    chance: float = 1e-3
+    """Chance of as many silent pixels, at most, if no fewer sent one event, two and three each: four of 5,940
+    beside one that sent hardly anything were slow ones of a dark current."""
 
     hardly: int = 3
     """Events of a pixel that sends hardly anything, at most."""
@@ -99,7 +100,9 @@ class SilentPixels:
     @property
     def needed(self) -> float:
         """Silent pixels from which on some are dead."""
-        return max(self.settings.least, self.settings.apart * self.hardly)
+        usual = (self.hardly + 1) / self.settings.hardly
+        by_chance = float(stats.poisson.isf(self.settings.chance, usual)) + 1
+        return max(by_chance, self.settings.apart * self.hardly)
 
     @property
     def found(self) -> bool:

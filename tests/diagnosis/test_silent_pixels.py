@@ -81,7 +81,16 @@ def test_no_other_effect_silences_single_pixels(scene, effect):
     found = find_silent_pixels(Measurement(events, scene), log_eps=1e-3)
     assert not found.found
     assert found.decides
-    assert found.limit().strength == pytest.approx(3 / found.asked)
+    assert found.limit().strength == pytest.approx(found.needed / found.asked)
+
+
+@pytest.mark.parametrize(
+    ("silent", "hardly", "dead"),
+    [(3, 0, False), (4, 0, True), (4, 1, False), (12, 10, False), (61, 21, True)],
+)
+def test_silent_pixels_are_more_than_those_that_send_hardly_anything_say(silent, hardly, dead):
+    """Four beside one were slow pixels of a dark current, twelve beside ten those of a slow pole."""
+    assert SilentPixels(np.arange(silent), 5940, hardly=hardly).found == dead
 
 
 def test_silence_at_the_end_of_a_range_is_no_death(scene):
