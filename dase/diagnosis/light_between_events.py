@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dase.events import Events
+from dase.fitting.held_events import rows_with_most_events
 from dase.fitting.measurement import Measurement
 from dase.probes.stimulus import log_light_of
 from dase.scenes.between_frames import CameraScene
@@ -189,12 +190,8 @@ def busiest_rows(events: Events, instants: int, settings: StepSettings = STEPS) 
         instants: At which light is looked at.
         settings: How much that may be.
     """
-    per_row = np.bincount(events.y, minlength=events.height)
     most = min(settings.samples // (instants * events.width), events.height * settings.events // len(events))
-    most = min(max(most, 8), events.height)
-    total = np.concatenate([[0], np.cumsum(per_row)])
-    first = int(np.argmax(total[most:] - total[:-most]))
-    return first, first + most
+    return rows_with_most_events(events, most)
 
 
 def beyond_those_alike(

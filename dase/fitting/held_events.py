@@ -50,7 +50,7 @@ class HeldEvents:
             scene: A clip, held or as its frames are written down.
         """
         times = scene.frame_times()
-        first, after = _busiest_rows(events, MOST // (len(times) * scene.width))
+        first, after = rows_with_most_events(events, MOST // (len(times) * scene.width))
         frame = np.searchsorted(times, events.t + 1e-9, side="right") - 1
         inside = (events.y >= first) & (events.y < after) & (frame >= 0) & (frame < len(times) - 1)
         events, frame = events.select(inside), frame[inside]
@@ -86,12 +86,12 @@ class HeldEvents:
         return first
 
 
-def _busiest_rows(events: Events, most: int) -> tuple[int, int]:
+def rows_with_most_events(events: Events, most: int) -> tuple[int, int]:
     """Return the rows with the most events: the first, and the one after the last.
 
     Args:
         events: Of the whole sensor.
-        most: Rows that are looked at, at most.
+        most: Rows that are looked at, at most; eight are, wherever there are so many.
     """
     most = min(max(most, 8), events.height)
     total = np.concatenate([[0], np.cumsum(np.bincount(events.y, minlength=events.height))])
