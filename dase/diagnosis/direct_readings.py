@@ -18,7 +18,7 @@ from dase.effects.jitter import Jitter
 from dase.effects.latency import Latency
 from dase.effects.refractory import Refractory
 from dase.effects.timestamp import Timestamp
-from dase.fitting.delays_after_frames import DelaysAfterFrames, delays_after_frames, slope_in_errors
+from dase.fitting.delays_after_frames import DelaysAfterFrames, delays_after_frames
 from dase.fitting.held_events import HeldEvents
 from dase.fitting.measurement import Measurement
 from dase.fitting.thresholds_of_frames import DrawnThresholds, thresholds_of_frames
@@ -94,12 +94,9 @@ def with_direct_readings(
     if not isinstance(scene, VideoScene) or not measurement.held or measurement.trust is not None:
         return found
     delays = delays_after_frames(measurement.compared_events(), scene)
-    effects = (
-        []
-        if delays is None or delays.width() > settings.width
-        else _effects_of(delays.brighter_half(), settings)
-    )
-    for effect, sentence, mine in effects:
+    if delays is None or delays.width() > settings.width:
+        return found
+    for effect, sentence, mine in _effects_of(delays.brighter_half(), settings):
         if effect.name not in task.effects or effect.name in task.given:
             continue
         if isinstance(effect, Latency) and _waits_for_frames(found.sensor, effect, measurement.held):
@@ -175,10 +172,9 @@ def _effects_of(
 ) -> list[tuple[Effect, str, dict[str, Estimate]]]:
     """Return the effects that delays show, each with a sentence and its parameters."""
     out: list[tuple[Effect, str, dict[str, Estimate]]] = []
-    # events of one group of pixels differ from another's by chance
     (late, slope), groups = delays.line(), delays.of_groups()
     if len(groups) < 3:
-        return out
+        return out  # by what groups of pixels differ is not known
     lines = np.array([one.line() for one in groups])
     errors = NINETY * lines.std(axis=0, ddof=1) / math.sqrt(len(groups))
     if late >= settings.latency:
@@ -195,7 +191,7 @@ def _effects_of(
         mine = {"timestamp.jitter": Estimate(jitter, jitter - half, jitter + half)}
         out.append((Timestamp(jitter=jitter, step=0.0), sentence, mine))
     cutoff = 1 / (2 * math.pi * max(slope, 1e-9))
-    if cutoff <= settings.cutoff and slope_in_errors(delays) >= settings.errors:
+    if cutoff <= settings.cutoff and delays.slope_in_errors() >= settings.errors:
         ends = [1 / (2 * math.pi * (slope + sign * float(errors[1]))) for sign in (1, -1)]
         sentence = "events come the later the more of its way a pixel has to go, and the darker it is"
         mine = {"bandwidth.cutoff": Estimate(cutoff, ends[0], ends[1])}

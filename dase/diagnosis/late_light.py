@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,7 +27,6 @@ from dase.signatures.result import Answer, Signature
 
 Array = NDArray[np.float64]
 Levels = NDArray[np.float32]
-
 
 LOOKED_AT = StepSettings(samples=4_000_000, events=200_000)
 """Pixels, instants and events."""
@@ -96,13 +96,16 @@ class Way:
         differ: What steps of the light then differ by, relative to the threshold.
         delay: Latency [s].
         poles: Of the low-pass, at the brightest light, ascending [Hz].
-        values: How many values it has.
     """
 
     differ: float
     delay: float = 0.0
     poles: tuple[float, ...] = ()
-    values: int = 0
+
+    @property
+    def values(self) -> int:
+        """How many values were sought; poles have a current without light, too."""
+        return (self.delay > 0) + len(self.poles) + (len(self.poles) > 0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,6 +169,13 @@ class _Steps:
             out.append(float(high - low) / 2 / float(middle) if middle > 0 else math.inf)
         return float(np.mean(out)) if out else math.inf
 
+    @cached_property
+    def light(self) -> Levels:
+        """Intensity half way between instants, relative to the brightest, shape (T - 1, P)."""
+        between = 0.5 * (self.level[:-1] + self.level[1:])
+        out: Levels = np.exp(between - np.float32(np.quantile(self.level, 0.99)))
+        return out
+
     def behind_pole(self, cutoff: float, dark: float, level: Levels | None = None) -> Levels:
         """Return the light behind a pole that goes with it, exact where it runs straight, shape (T, P).
 
@@ -175,12 +185,10 @@ class _Steps:
             level: Log intensity that it filters, shape (T, P); None for that of the scene.
         """
         seen = self.level if level is None else level
-        brightest = float(np.quantile(self.level, 0.99))
         out = np.empty_like(seen)
         now = out[0] = seen[0]
         for n, gap in enumerate(np.diff(self.times)):
-            light = np.exp(0.5 * (self.level[n] + self.level[n + 1]) - brightest)
-            x = np.maximum((2 * np.pi * cutoff * gap / (1 + dark)) * (light + dark), 1e-6)
+            x = np.maximum((2 * np.pi * cutoff * gap / (1 + dark)) * (self.light[n] + dark), 1e-6)
             decay = np.exp(-x)
             now = seen[n + 1] - (seen[n + 1] - seen[n]) * ((1 - decay) / x) + (now - seen[n]) * decay
             out[n + 1] = now
@@ -243,7 +251,7 @@ def _ways_of(steps: _Steps, settings: LateLightSettings) -> list[Way]:
     low, high, count = settings.delays
     begin = min(np.geomspace(low, high, count), key=lambda delay: steps.differ(steps.level, delay))
     differ, logs = _least(lambda q: steps.differ(steps.level, math.exp(q[0])), [math.log(begin)], [0.15], 12)
-    latency = Way(differ, delay=math.exp(logs[0]), values=1)
+    latency = Way(differ, delay=math.exp(logs[0]))
 
     def pole(logs: Sequence[float]) -> float:
         return steps.differ(steps.behind_pole(math.exp(logs[0]), dark_of(logs[1])))
@@ -252,7 +260,7 @@ def _ways_of(steps: _Steps, settings: LateLightSettings) -> list[Way]:
     starts = [(math.log(f), math.log(d)) for f in np.geomspace(low, high, count) for d in settings.darks]
     differ, logs = _least(pole, min(starts, key=pole), [0.25, 0.8], 22)
     slow = math.exp(logs[0])
-    one = Way(differ, poles=(slow,), values=2)
+    one = Way(differ, poles=(slow,))
 
     def poles(logs: Sequence[float]) -> float:
         dark, first, apart = dark_of(logs[2]), math.exp(logs[0]), math.exp(abs(logs[1]))
@@ -260,14 +268,14 @@ def _ways_of(steps: _Steps, settings: LateLightSettings) -> list[Way]:
 
     differ, both = _least(poles, [logs[0] + 0.5, 0.3, logs[1]], [0.25, 0.3, 0.8], 32)
     ends = (math.exp(both[0]), math.exp(both[0] + abs(both[1])))
-    two = Way(differ, poles=ends, values=3)
+    two = Way(differ, poles=ends)
 
     def late_pole(logs: Sequence[float]) -> float:
         return steps.differ(steps.behind_pole(math.exp(logs[0]), dark_of(logs[2])), math.exp(logs[1]))
 
     lag = math.log(0.3 / (2 * math.pi * slow))
     differ, both = _least(late_pole, [logs[0] + 0.4, lag, logs[1]], [0.25, 0.6, 0.8], 32)
-    return [latency, one, two, Way(differ, math.exp(both[1]), (math.exp(both[0]),), values=3)]
+    return [latency, one, two, Way(differ, math.exp(both[1]), (math.exp(both[0]),))]
 
 
 def _least(

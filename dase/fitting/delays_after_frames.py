@@ -111,6 +111,13 @@ class DelaysAfterFrames:
         slope, begin = np.polyfit(ways[: settings.straight], late[: settings.straight, 0], 1)
         return float(begin), float(slope)
 
+    def slope_in_errors(self) -> float:
+        """Return by how many standard errors delays grow with the way; 0 of too few groups to tell."""
+        slopes = np.array([one.line()[1] for one in self.of_groups()])
+        if len(slopes) < 3:
+            return 0.0
+        return float(slopes.mean() / max(slopes.std(ddof=1) / math.sqrt(len(slopes)), 1e-12))
+
     def brighter_half(self) -> DelaysAfterFrames:
         """Return those in brighter light, where pixels are at rest when they take their memory."""
         return self._select(self.level > np.median(self.level))
@@ -163,12 +170,3 @@ def delays_after_frames(
     used = np.concatenate(chosen)
     group = seen.row[first[used]] // settings.rows % settings.blocks
     return DelaysAfterFrames(np.concatenate(ways), seen.late[first[used]], now[used], seen.gap, group)
-
-
-def slope_in_errors(delays: DelaysAfterFrames) -> float:
-    """Return by how many standard errors delays grow with the way."""
-    groups = delays.of_groups()
-    if len(groups) < 3:
-        return 0.0
-    slopes = np.array([one.line()[1] for one in groups])
-    return float(slopes.mean() / max(slopes.std(ddof=1) / math.sqrt(len(slopes)), 1e-12))

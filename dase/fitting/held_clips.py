@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dase.events import Events
-from dase.fitting.delays_after_frames import delays_after_frames, slope_in_errors
+from dase.fitting.delays_after_frames import delays_after_frames
 from dase.probes.stimulus import light_of
 from dase.scenes.scene import LOG_EPS, Scene
 from dase.scenes.video import VideoScene
@@ -204,7 +204,7 @@ def _come_by_their_way(
         return False
     delays = delays_after_frames(events, scene)
     return (
-        delays is not None and delays.width() <= settings.width and slope_in_errors(delays) >= settings.later
+        delays is not None and delays.width() <= settings.width and delays.slope_in_errors() >= settings.later
     )
 
 

@@ -7,7 +7,7 @@ import pytest
 from helpers.frame_simulator import counted_between_frames, shaken_texture
 from helpers.held_pixels import held_with_low_pass
 
-from dase.fitting.delays_after_frames import delays_after_frames, slope_in_errors
+from dase.fitting.delays_after_frames import delays_after_frames
 from dase.fitting.held_clips import holds_frames
 from dase.fitting.held_events import HeldEvents
 from dase.fitting.measurement import as_measurement
@@ -27,7 +27,7 @@ def scene() -> VideoScene:
 def test_latency_and_low_pass_are_read_off_delays(scene, late, cutoff):
     events = held_with_low_pass(scene, cutoff=cutoff, late=late)
     found = delays_after_frames(events, scene)
-    assert slope_in_errors(found) > 5
+    assert found.slope_in_errors() > 5
     begin, slope = found.brighter_half().line()
     assert begin == pytest.approx(late, rel=0.08)
     assert slope == pytest.approx(1 / (2 * np.pi * cutoff), rel=0.15)
@@ -45,7 +45,7 @@ def test_a_held_clip_tells_the_same_once_it_is_taken_for_one(scene):
 def test_light_that_goes_straight_shows_no_delay(scene):
     events = counted_between_frames(scene, 0.02)
     found = delays_after_frames(events, scene)
-    assert found.width() > 0.3 or abs(slope_in_errors(found)) < 5
+    assert found.width() > 0.3 or abs(found.slope_in_errors()) < 5
     assert not holds_frames(events, scene)
 
 
