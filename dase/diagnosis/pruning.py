@@ -44,7 +44,12 @@ def prune_model(
             # at the floor is not enough where chance is far below: dark current at 1.08 for leak at 0.35
             if judged.error > max(LIMITS.quiet, judged.reach, judgement.error + task.settings.tie):
                 continue
-            if without is not None and not explains_remainder(judged, without, task.settings):
+            # the rival of what does not explain it either need not
+            if (
+                without is not None
+                and explains_remainder(judgement, without, task.settings)
+                and not explains_remainder(judged, without, task.settings)
+            ):
                 continue
             if lacks_effect_of(task, swapped, judged, model):
                 continue

@@ -29,7 +29,7 @@ from dase.signatures.double_events import IntervalCounts, find_double_events
 from dase.signatures.fixed_pattern import HalfCounts, find_fixed_pattern
 from dase.signatures.flicker import find_flicker
 from dase.signatures.frame_coupling import BurstClock, find_frame_coupling
-from dase.signatures.full_bus import find_full_bus
+from dase.signatures.full_bus import find_even_bus, find_full_bus
 from dase.signatures.hot_pixels import CalmCounts, find_hot_pixels
 from dase.signatures.opposite_pairs import PairCounts, find_opposite_pairs
 from dase.signatures.result import Signatures
@@ -239,7 +239,9 @@ def find_signatures(
         lamp=lamp.frequency if lamp else 0.0,
     )  # fmt: skip
     hot, hot_pixels = look_for_hot()
-    stamps = find_time_stamps(first.first_events(), hot_pixels, each, lamp=lit)
+    even_bus = find_even_bus(first.first_events(), each)
+    # what a bus sends evenly comes at multiples of its time for one event
+    stamps = find_time_stamps(first.first_events(), hot_pixels, each, repeats=lit or even_bus is not None)
     tick = max(stamps.details.get(name, 0.0) for name in ("step", "period")) if stamps.found else 0.0
     if tick and not hot.found:
         hot, hot_pixels = look_for_hot(tick=tick)
@@ -252,6 +254,6 @@ def find_signatures(
         find_grouping(second.groups, each),
         stamps,
         find_double_events(second.intervals, hot_pixels, each, tick),
-        find_full_bus(first.clock, first.first_events(), each, tick),
+        even_bus or find_full_bus(first.clock, first.first_events(), each, tick),
     )
     return Signatures(width, height, first.count, duration, level, entries)

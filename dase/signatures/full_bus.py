@@ -5,7 +5,8 @@ the other as fast as the bus sends, and hardly anything scatters.
 
 Where time stamps are fine enough, a bus shows however full it is: it sends one event at a time, so events of
 different pixels never come closer than the time it takes for one. Pixels know nothing of each other: without
-a bus, how far apart they send is as in a Poisson process over any short time.
+a bus, how far apart they send is as in a Poisson process over any short time. While events wait for it, they
+come as evenly as it sends, also where a tick of the time stamps is as long as that takes.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from dase.events import Events
-from dase.formatting import format_count, format_metric, format_percent
+from dase.formatting import format_count, format_metric, format_percent, format_seconds
 from dase.signatures.clock import ClockCounts
 from dase.signatures.kinds import FULL_BUS
 from dase.signatures.result import Answer, Signature, judge_signature, without_answer
@@ -42,6 +43,14 @@ class BusSettings:
     missing: float = 0.1  # of those expected that may be there
     ticks: float = 2.5  # of the time stamps that the time for one event must last
     local: int = 64  # intervals over which the rate is taken as even
+    run: int = 64  # events that come evenly or not
+    straight: float = 0.02  # of the time for one event: how far from evenly they may come, or a tick
+    wander: float = 5.0  # ticks that as many events at random must wander off at least, to be told from those
+    alike: float = 0.9  # of the runs that are even, share of which must be equally fast
+    own: float = 0.01  # how far from a tick, relative: converters move equal stamps apart by one
+    shortest: float = (
+        2e-8  # time for one event [s]: below, stamps were moved apart by what is just not nothing
+    )
 
 
 def _scatter_of(counts: NDArray[np.float64], chosen: NDArray[np.bool_]) -> tuple[float, int]:
@@ -49,6 +58,54 @@ def _scatter_of(counts: NDArray[np.float64], chosen: NDArray[np.bool_]) -> tuple
     both = chosen[1:] & chosen[:-1]
     a, b = counts[1:][both], counts[:-1][both]
     return float(((a - b) ** 2 / np.maximum(a + b, 1)).mean()) if len(a) else 1.0, len(a)
+
+
+def find_even_bus(first: Events, level: float, settings: BusSettings | None = None) -> Signature | None:
+    """Look for runs of events that come as evenly as a bus sends them, all at one rate.
+
+    The null is a Poisson process whose rate is even over a run: events wander about the straight line from
+    the first to the last as a Brownian bridge does, whose largest distance has Kolmogorov's distribution.
+
+    Args:
+        first: The first events.
+        level: p below which it is there.
+        settings: What comes evenly.
+
+    Returns:
+        None where no bus is seen.
+    """
+    s = settings or BusSettings()
+    tick, many = _file_tick(first), len(first) // s.run
+    if many < s.fewest:
+        return None
+    t = first.t[: many * s.run].reshape(many, s.run)
+    gone = t - t[:, :1]
+    service = gone[:, -1] / (s.run - 1)
+    off = np.abs(gone - service[:, None] * np.arange(s.run)).max(1)
+    slack = 1.01 * np.maximum(tick, s.straight * service)
+    even = (off <= slack) & (service > s.shortest) & (service * np.sqrt(s.run) >= s.wander * tick)
+    even &= np.abs(service - tick) > s.own * tick
+    if not even.any():
+        return None
+    usual = float(np.median(service[even]))
+    # stamps at both ends are rounded
+    alike = even & (np.abs(service - usual) <= 2 * tick / (s.run - 1) + 1e-3 * usual)
+    count = int(alike.sum())
+    if count < max(s.fewest, s.alike * even.sum()):
+        return None
+    service_time = float(np.mean(service[alike]))
+    wide = max(slack[alike].max() / service_time, s.straight) / np.sqrt(s.run)
+    p = float(stats.binom.sf(count - 1, many, stats.kstwobign.cdf(wide)))
+    low, high = stats.beta.interval(0.9, count + 0.5, many - count + 0.5)
+    entry = Signature(
+        name=FULL_BUS, answer=Answer.NOT_SEEN, p=p, size=count / many, low=float(low), high=float(high),
+        unit="share of the events", least=s.least,
+        sentence=f"{format_percent(count / many)} of the events come one after the other at even times, each "
+        f"{format_seconds(service_time)}: a bus of {format_metric(1 / service_time, 'events/s')}",
+        details={"rate": 1 / service_time},
+    )  # fmt: skip
+    entry = judge_signature(entry, level, "")
+    return entry if entry.found else None
 
 
 def find_full_bus(

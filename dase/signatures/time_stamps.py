@@ -100,7 +100,7 @@ def find_time_stamps(
     hot: NDArray[np.bool_],
     level: float,
     *,
-    lamp: bool = False,
+    repeats: bool = False,
     settings: StampSettings | None = None,
 ) -> Signature:
     """Look for regularities of the time stamps.
@@ -112,7 +112,8 @@ def find_time_stamps(
         events: The first of the recording, as many as `StampSettings.most`.
         hot: Pixels to leave out, shape (H * W,).
         level: p below which there are any.
-        lamp: Whether the light flickers: then pixels that see the same repeat the same intervals.
+        repeats: Whether the light flickers, so that pixels that see the same repeat the same intervals, or a
+            bus sends events at equal ones.
         settings: How regularities are looked for.
     """
     s = settings or StampSettings()
@@ -121,7 +122,7 @@ def find_time_stamps(
         return without_answer(
             TIME_STAMPS, f"{format_count(len(kept))} events, fewer than {format_count(s.fewest)}"
         )
-    entry = _find_pattern(kept) or (None if lamp else _find_period(kept, s))
+    entry = _find_pattern(kept) or (None if repeats else _find_period(kept, s))
     if entry is None:
         return Signature(
             name=TIME_STAMPS,

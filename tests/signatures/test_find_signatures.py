@@ -450,6 +450,31 @@ def test_a_bus_shows_that_is_never_or_always_full(share, tick):
     assert not dase.find_signatures(wanted)["full bus"].found
 
 
+@pytest.mark.parametrize("service", [0.77e-6, 1.31e-6, 2.32e-6, 8.52e-6])
+def test_events_come_as_evenly_as_a_bus_sends_them(service):
+    """Steps of a simulator send many events at once; stamps are whole microseconds."""
+    rng = np.random.default_rng(8)
+    times = np.sort(5e-3 * rng.integers(0, 200, 60_000) + rng.uniform(0, 1e-4, 60_000))
+    x, y = (rng.integers(0, size, len(times)).astype(np.uint16) for size in (64, 48))
+    sent, free = [], 0.0
+    for time in times:
+        free = max(time, free) + service
+        sent.append(free)
+    on = rng.random(len(times)) < 0.5
+
+    def signatures(t):
+        return dase.find_signatures(dase.Events(np.floor(np.sort(t) * 1e6) * 1e-6, x, y, on, 64, 48))
+
+    found = signatures(sent)
+    assert found["full bus"].found
+    assert found["full bus"].details["rate"] == pytest.approx(1 / service, rel=2e-3)
+    assert not found["time stamps"].found
+    # as many events in as long bursts, at random
+    bursts = np.floor(np.asarray(sent) / 5e-3)
+    longest = float(np.max(np.asarray(sent) - 5e-3 * bursts))
+    assert not signatures(5e-3 * bursts + rng.uniform(0, longest, len(times)))["full bus"].found
+
+
 def test_stamps_made_to_increase_are_no_bus():
     """Some converters move equal stamps apart by one tick."""
     rng = np.random.default_rng(5)
