@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -227,10 +227,15 @@ def find_late_events(
         return ()
     # a simulator that knows frames alone is late by a frame itself
     soonest, slowest = max(settings.soonest, 3 * frame_step), min(best.poles, default=0.0)
-    if 0 < best.delay < soonest or slowest > settings.fastest:
+    if slowest > settings.fastest:
         return ()
     if any(one is not best and one.values <= best.values for one in near):
         return ()  # a search tells more, or names both
+    if 0 < best.delay < soonest:
+        # whoever is late by so little, a pole that leaves next to nothing beside it is one
+        if not (best.poles and frame_step and best.differ <= settings.even):
+            return ()
+        best = replace(best, delay=0.0)
     return _signatures_of(best, at_once)
 
 

@@ -42,6 +42,12 @@ class Jitter(Effect):
         plausible=(0.02, 0.5),
         about="standard deviation over events, relative to the threshold of the pixel",
         # a world that looks for crossings at steps of time sends the first after a dead time a little late,
-        # beyond the threshold by chance; the point spread of a lens is no Gaussian, nor known to a per cent
-        clear_beside=(("refractory", 0.15), ("optics_blur", 0.06)),
+        # beyond the threshold by chance; the point spread of a lens is no Gaussian, nor known to a per cent;
+        # a low-pass that goes step by step is not quite that of the model
+        clear_beside=(
+            ("refractory", 0.15),
+            ("optics_blur", 0.06),
+            ("bandwidth", 0.06),
+            ("second_order", 0.06),
+        ),
     )

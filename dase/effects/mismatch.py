@@ -64,8 +64,13 @@ class Mismatch(Effect):
         plausible=(0.02, 0.5),
         about="standard deviation over pixels, relative to the threshold",
         # a world that sets its memory at steps of time, beyond the threshold by chance, has such pixels; so
-        # has a lens whose point spread is not quite that of the model
-        clear_beside=(("refractory", 0.05), ("optics_blur", 0.06)),
+        # has a lens whose point spread is not quite that of the model, or a low-pass that goes step by step
+        clear_beside=(
+            ("refractory", 0.05),
+            ("optics_blur", 0.06),
+            ("bandwidth", 0.06),
+            ("second_order", 0.06),
+        ),
     )
     relative_to: str = choice(
         "own",

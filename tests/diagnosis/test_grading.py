@@ -368,6 +368,18 @@ def test_little_that_differs_beside_a_dead_time_is_in_doubt(name, spread, period
     assert not is_small_beside_another(model, "threshold.on", Estimate(0.1, 0.1, 0.1))
 
 
+@pytest.mark.parametrize("beside", ["bandwidth", "second_order"])
+@pytest.mark.parametrize("name", ["jitter", "mismatch"])
+def test_little_that_differs_beside_a_low_pass_is_in_doubt(name, beside):
+    """Other simulators filter step by step: thresholds that differ by 2 to 5 % make up for that."""
+    both = Sensor().with_effect(EFFECTS[name](spread=0.02)).with_effect(EFFECTS[beside](cutoff=100.0))
+    for sensor, in_doubt in ((both, True), (both.without(beside), False)):
+        for spread, small in ((0.02, True), (0.08, False)):
+            value = Estimate(spread, 0.9 * spread, 1.1 * spread)
+            got = is_small_beside_another(model_of(sensor), f"{name}.spread", value)
+            assert got == (in_doubt and small)
+
+
 def test_a_dark_current_below_what_the_logarithm_adds_is_in_doubt():
     """IEBCS adds one of 10,000 grey values before its logarithm: a dark current of 0.00018 was supported."""
     model = model_of(Sensor().with_effect(EFFECTS["dark"](current=2e-4)))

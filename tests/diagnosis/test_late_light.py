@@ -95,6 +95,17 @@ def test_a_pole_and_a_latency_are_told_apart(scene):
     assert found == pytest.approx({"pole": 30.0, "delay": 4e-3}, rel=0.15)
 
 
+@pytest.mark.slow
+def test_a_pole_is_told_beside_a_latency_that_a_simulator_of_frames_may_have(scene):
+    """It is later by less than three frames: of which of them light is, nobody tells."""
+    events = late_events(scene, delay=3e-3, poles=(30.0,))
+    found = find_late_events(Measurement(events, scene), log_eps=1e-3, frame_step=2e-3)
+    assert [list(one.details) for one in found] == [["pole"]]
+    assert found[0].details["pole"] == pytest.approx(30.0, rel=0.1)
+    late = late_events(scene, delay=3e-3)
+    assert not find_late_events(Measurement(late, scene), log_eps=1e-3, frame_step=2e-3)
+
+
 @pytest.mark.parametrize("late", [{}, {"spread": 0.2}, {"delay": 2e-4}, {"poles": (3000.0,)}])
 def test_nothing_is_told_of_what_is_not_late(scene, late):
     assert told(scene, **late) == {}
