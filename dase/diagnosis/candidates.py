@@ -21,6 +21,7 @@ from dase.fitting.model import (
     calibration_while_fitting,
     places_around,
     places_between,
+    places_in_uneven_light,
     refit_work,
     shift_periodic_effects,
     starting_places,
@@ -121,6 +122,8 @@ class Screening:
         places: In order of their loss, shape (M, P).
         losses: Shape (M,).
         most: Samples per step that no model exceeded.
+        uneven: The best place with other effects put right for light that differs from pixel to pixel, shape
+            (1, P); shape (0, P) where there is none.
     """
 
     effect: Effect
@@ -130,6 +133,7 @@ class Screening:
     places: Array
     losses: Array
     most: int
+    uneven: Array
 
     @property
     def relative_loss(self) -> float:
@@ -179,16 +183,21 @@ def screen_effect(
     few = half.slow(model.space)
     # most candidates are nothing: the finalists alone are sampled as finely as they need
     most = samples_of_screening(present.sensor, half.frame.step)
-    places, losses = yield from ranking_work(
-        half, model.space, starting_places(model, effect, few=few), seed=seed, most=most
-    )
+    starts = starting_places(model, effect, few=few)
+    places, losses = yield from ranking_work(half, model.space, starts, seed=seed, most=most)
     between = places_between(model, effect, places[0])
     if len(between) and not few:
         more, their_losses = yield from ranking_work(half, model.space, between, seed=seed, most=most)
         places, losses = np.concatenate([places, more]), np.concatenate([losses, their_losses])
         order = np.argsort(losses, kind="stable")
         places, losses = places[order], losses[order]
-    return Screening(effect, model, half, before[0], places, losses, most)
+    uneven = places_in_uneven_light(model, effect, starts)
+    if len(uneven):
+        uneven, their_losses = yield from ranking_work(half, model.space, uneven, seed=seed, most=most)
+        places, losses = np.concatenate([places, uneven]), np.concatenate([losses, their_losses])
+        order = np.argsort(losses, kind="stable")
+        places, losses = places[order], losses[order]
+    return Screening(effect, model, half, before[0], places, losses, most, uneven[:1])
 
 
 def screen_and_descend(
@@ -233,6 +242,9 @@ def descend_from_screening(
     elsewhere = np.abs(places - places[0]).max(1, initial=0.0) > settings.apart  # none may be free
     others = np.flatnonzero(elsewhere & (losses < settings.second_start * losses[0]))
     begins = places[[0, *others[: 0 if slow else 1]]]
+    # on the other side of a ridge, however slow
+    further = [one for one in screening.uneven if not (begins == one).all(1).any()]
+    begins = np.concatenate([begins, *(one[None] for one in further)])
     ends = yield from side_by_side_work(
         [
             descent_work(

@@ -64,6 +64,8 @@ class Parameter:
             three times the plausible range does: what is beyond would cost much and tell nothing more.
         clear_beside: (name, value) pairs of effects beside which a smaller value is in doubt: another way in
             which a world does those looks like it.
+        over_pixels: Whether it says how far pixels differ in the contrast at which they send, by chance: what
+            differs from place to place looks like it, see `Effect.light_left`.
     """
 
     name: str
@@ -80,6 +82,7 @@ class Parameter:
     between_samples: bool = False
     farthest: float = math.inf
     clear_beside: tuple[tuple[str, float], ...] = ()
+    over_pixels: bool = False
 
     @property
     def search_starts(self) -> Starts:
@@ -102,12 +105,13 @@ def parameter(
     between_samples: bool = False,
     farthest: float = math.inf,
     clear_beside: tuple[tuple[str, float], ...] = (),
+    over_pixels: bool = False,
 ) -> Any:
     """Declare a parameter of an effect; see `Parameter`."""
     facts = dict(
         unit=unit, default=default, off=off, bounds=bounds, plausible=plausible, about=about, starts=starts,
         periodic=periodic, fitted=fitted, nearby=nearby, between_samples=between_samples,
-        farthest=farthest, clear_beside=clear_beside,
+        farthest=farthest, clear_beside=clear_beside, over_pixels=over_pixels,
     )  # fmt: skip
     return field(default=default, metadata={"parameter": facts})
 
@@ -343,6 +347,16 @@ class Effect:
         A search begins there, too: with this effect those others change nothing any more.
         """
         return {}
+
+    def light_left(self) -> tuple[float, ...]:
+        """Return shares of the light that are left to pixels, where more is left to some than to others.
+
+        A model without this effect is fitted to the mean of what pixels get: the intensities at which its
+        other effects act are too high by as much, and it has pixels differ by chance that differ by their
+        place. Where this effect is tried, a search begins with both put right, too, by each of these shares.
+        () where all pixels get the same light.
+        """
+        return ()
 
     def otherwise(self, beside: Sequence[Effect]) -> list[Self]:
         """Return this effect by the other rules that a fit has to try, too, as no descent gets there.

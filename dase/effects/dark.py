@@ -69,6 +69,7 @@ class Dark(Effect):
         bounds=(0.0, 3.0),
         plausible=(0.0, 1.0),
         about="standard deviation of its natural logarithm over pixels",
+        over_pixels=True,
     )
     speed: str = choice(
         "shared",

@@ -71,6 +71,7 @@ class Mismatch(Effect):
             ("bandwidth", 0.06),
             ("second_order", 0.06),
         ),
+        over_pixels=True,
     )
     relative_to: str = choice(
         "own",

@@ -516,6 +516,35 @@ def starting_places(model: FittedModel, effect: Effect, *, few: bool = False) ->
     return np.array(out)
 
 
+def places_in_uneven_light(model: FittedModel, effect: Effect, places: Array) -> Array:
+    """Return places at which other effects go with the light that an effect leaves, pixel by pixel.
+
+    Without it the model was fitted to the mean light: intensities at which effects act, as a dark current or
+    a knee, have gone up by as much as light is missing, and differences between pixels by chance have taken
+    what is by place. With these the effect has nothing to explain, and the way to where they are right leads
+    over a ridge.
+
+    Args:
+        model: With the effect.
+        effect: What is tried.
+        places: From which it is tried, shape (M, P).
+
+    Returns:
+        N places, shape (N, P); none where all pixels get the same light, or no other effect is concerned.
+    """
+    axes = [(n, axis) for n, axis in enumerate(model.space.axes) if axis.effect is not type(effect)]
+    changed = [(n, axis) for n, axis in axes if axis.fact.unit == "intensity" or axis.fact.over_pixels]
+    out = []
+    for way in range(len(effect.light_left()) if changed else 0):
+        for place in places.copy():
+            share = model.space.at(place)[effect.name].light_left()[way]
+            for n, axis in changed:
+                value = axis.low if axis.fact.over_pixels else share * axis.to_value(place[n])
+                place[n] = float(axis.to_place(value))
+            out.append(place)
+    return np.reshape(out, (len(out), len(model.place)))
+
+
 def places_between(model: FittedModel, effect: Effect, place: Array) -> Array:
     """Return places between that from which an effect is best tried and those beside it.
 
