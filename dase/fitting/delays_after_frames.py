@@ -54,6 +54,15 @@ class DelaySettings:
     rows: int = 8
     """Rows beside each other that are of one group."""
 
+    levels: int = 6
+    """Of light, as many events in each, within which delays in corners are compared with those elsewhere."""
+
+    turns: int = 8
+    """Steps by which the light of corners is told."""
+
+    steepest: float = 9.0
+    """Square of the tangent of the angle to a corner, at most: 0.99 of the light are lost there."""
+
 
 DELAYS = DelaySettings()
 
@@ -68,6 +77,7 @@ class DelaysAfterFrames:
         level: Log intensity of the new light, shape (N,).
         gap: Time from frame to frame [s].
         group: Of the pixel, shape (N,): groups differ by chance.
+        square: Square distance of the pixel from the middle, in units of the corner's, shape (N,).
     """
 
     way: Array
@@ -75,6 +85,7 @@ class DelaysAfterFrames:
     level: Array
     gap: float
     group: NDArray[np.int64]
+    square: Array
 
     def quantiles(self, shares: tuple[float, ...], settings: DelaySettings = DELAYS) -> tuple[Array, Array]:
         """Return the median way, and quantiles of the delay [s], per bin of ways.
@@ -118,6 +129,56 @@ class DelaysAfterFrames:
             return 0.0
         return float(slopes.mean() / max(slopes.std(ddof=1) / math.sqrt(len(slopes)), 1e-12))
 
+    def tangent(self, settings: DelaySettings = DELAYS) -> float:
+        """Return the square of the tangent of the angle at which light gets to the corner, by the cos⁴ law.
+
+        A low-pass is slower where less light gets, so in a clip's light that is alike delays grow with the
+        way by more in a corner. What light does by itself, as a low-pass that follows it in another way, is
+        the same there as in the middle.
+
+        Args:
+            settings: How finely light is told apart.
+        """
+        edges = np.quantile(self.level, np.arange(1, settings.levels) / settings.levels)
+        bins = np.searchsorted(edges, self.level)
+        cells = [self._select(bins == n) for n in range(settings.levels)]
+        cells = [one for one in cells if len(one.way) >= 60]
+        tangent = 0.0
+        for _ in range(settings.turns):
+            found = np.array([one._growth_left(tangent) for one in cells])
+            found = found[np.isfinite(found).all(1)] if len(found) else np.empty((0, 2))
+            if not len(found):
+                return 0.0
+            step = float(np.average(found[:, 0], weights=found[:, 1]))
+            # a growth by g from the middle to the corner, about the mean square distance
+            tangent = float(np.clip(tangent + 0.5 * step, -0.5, settings.steepest))
+        return tangent
+
+    def _growth_left(self, tangent: float) -> tuple[float, float]:
+        """Return by which part a slope still grows from the middle to the corner, and its weight.
+
+        Args:
+            tangent: With which the light of a corner is counted already.
+        """
+        way = self.way * (1.0 + tangent * self.square) ** 2
+        way, square = way / max(float(np.mean(way)), 1e-300), self.square - np.mean(self.square)
+        level = self.level - np.mean(self.level)
+        factors = np.stack([np.ones_like(way), way, way * square, level, way * level], 1)
+        late = self.late / max(float(np.median(self.late)), 1e-9)
+        weight = np.ones_like(late)
+        for _ in range(6):  # what is late by far is of another way
+            root = np.sqrt(weight)
+            slopes = np.linalg.lstsq(factors * root[:, None], late * root, rcond=None)[0]
+            off = late - factors @ slopes
+            # long delays differ by more, of which there are more in the corners
+            size = np.maximum(factors @ slopes, 0.3)
+            weight = 1 / (1 + (off / size / (3 * np.median(np.abs(off / size)) + 1e-12)) ** 2) / size**2
+        if slopes[1] <= 0:
+            return math.nan, 0.0
+        bare = factors.T @ (factors * weight[:, None])
+        error = np.linalg.pinv(bare)[2, 2] * np.average(off**2, weights=weight)
+        return float(slopes[2] / slopes[1]), float(slopes[1] ** 2 / max(error, 1e-300))
+
     def brighter_half(self) -> DelaysAfterFrames:
         """Return those in brighter light, where pixels are at rest when they take their memory."""
         return self._select(self.level > np.median(self.level))
@@ -130,7 +191,7 @@ class DelaysAfterFrames:
 
     def _select(self, used: NDArray[np.bool_]) -> DelaysAfterFrames:
         return DelaysAfterFrames(
-            self.way[used], self.late[used], self.level[used], self.gap, self.group[used]
+            self.way[used], self.late[used], self.level[used], self.gap, self.group[used], self.square[used]
         )
 
 
@@ -168,5 +229,10 @@ def delays_after_frames(
     if sum(map(len, chosen)) < settings.least:
         return None
     used = np.concatenate(chosen)
-    group = seen.row[first[used]] // settings.rows % settings.blocks
-    return DelaysAfterFrames(np.concatenate(ways), seen.late[first[used]], now[used], seen.gap, group)
+    row = seen.row[first[used]]
+    x = pixel[used] % scene.width - 0.5 * (scene.width - 1)
+    y = row - 0.5 * (scene.height - 1)
+    corner = (0.5 * (scene.width - 1)) ** 2 + (0.5 * (scene.height - 1)) ** 2
+    square = (x**2 + y**2) / max(corner, 1.0)
+    group = row // settings.rows % settings.blocks
+    return DelaysAfterFrames(np.concatenate(ways), seen.late[first[used]], now[used], seen.gap, group, square)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from helpers.brief_diagnosis import NO_LIMITS
-from helpers.frame_simulator import shaken_texture
+from helpers.frame_simulator import HEIGHT, WIDTH, shaken_texture
 from helpers.held_pixels import held_with_low_pass
 
 import dase
@@ -60,6 +60,29 @@ def test_pixels_of_a_slow_scene_have_the_frame_for_their_memory():
     found = diagnosed(held_with_low_pass(slow, spread=0.02), slow)
     assert found.findings == ()
     assert found.errors[-1] < 0.5
+
+
+@pytest.mark.parametrize("loss", [0.5, 0.0])
+def test_pixels_that_are_slower_in_the_corners_tell_of_vignetting(scene, loss):
+    """A low-pass so fast that it is no finding by itself; the clip is the one before the lens."""
+    y, x = np.mgrid[:HEIGHT, :WIDTH].astype(float)
+    square = (x - (WIDTH - 1) / 2) ** 2 + (y - (HEIGHT - 1) / 2) ** 2
+    light = np.cos(np.arctan(np.sqrt(((1 - loss) ** -0.5 - 1) * square / square.max()))) ** 4
+    times = scene.sample_times()
+    darker = VideoScene((scene.frames(times) * light).astype(np.float32), times)
+    events = held_with_low_pass(darker, cutoff=2e4, late=0.1e-3, stamps=0.01e-3, spread=0.02)
+    found = dase.diagnose(
+        events, scene=scene, effects={**TRIED, "vignetting": EFFECTS["vignetting"]}, most=1, pixels=200,
+        settings=NO_LIMITS,
+    )  # fmt: skip
+    grades = {one.effect: one.grade for one in found.findings}
+    if loss == 0.0:
+        assert "vignetting" not in grades
+    else:
+        assert grades["vignetting"] is Grade.CERTAIN
+        estimate = found.parameters["vignetting.loss"]
+        assert estimate.value == pytest.approx(loss, abs=0.12)
+        assert estimate.low < loss < estimate.high
 
 
 def test_latency_of_more_than_a_frame_is_left_to_the_search(scene):
