@@ -55,8 +55,8 @@ class ReadingSettings:
 
     errors: float = 5.0
     """Standard errors by which delays grow with the way, at least, for a low-pass; and by which they grow by
-    more in the corners, for a vignetting: at most 3.9 in the held clips of IEBCS (development) without one
-    whose delays grow, and 9.7 in one with a loss of 0.35."""
+    more in the corners, for a vignetting: at most 3.9 in 20 held clips of IEBCS (development) without one,
+    and 9.7 in one with a loss of 0.35."""
 
     loss: float = 0.1
     """Share of the light that is lost in a corner, at least."""
