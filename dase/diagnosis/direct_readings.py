@@ -54,9 +54,11 @@ class ReadingSettings:
     """[Hz] At most, at intensity 1."""
 
     errors: float = 5.0
-    """Standard errors by which delays grow with the way, at least, for a low-pass; and by which they grow by
-    more in the corners, for a vignetting: at most 3.9 in 20 held clips of IEBCS (development) without one,
-    and 9.7 in one with a loss of 0.35."""
+    """Standard errors by which delays grow with the way, at least, for a low-pass."""
+
+    corner_errors: float = 6.0
+    """Standard errors by which they grow by more in the corners, at least, for a vignetting: at most 3.9 in
+    20 held clips of IEBCS (development) without one, and 9.7 in one with a loss of 0.35."""
 
     loss: float = 0.1
     """Share of the light that is lost in a corner, at least."""
@@ -228,7 +230,7 @@ def _vignetting_of(
     tangent = delays.tangent()
     each = np.array([one.tangent() for one in groups])
     error = float(each.std(ddof=1)) / math.sqrt(len(each))
-    if tangent < settings.errors * error:
+    if tangent < settings.corner_errors * error:
         return None
     half = math.hypot(NINETY * error, settings.known_corner * tangent)
     loss, low, high = (1 - (1 + one) ** -2.0 for one in (tangent, max(tangent - half, 0.0), tangent + half))

@@ -8,7 +8,8 @@ waited for each other, or share a slow clock's tick, and are no doubles.
 
 A simulator that works frame by frame sends the events of a pixel in a frame some hundred microseconds
 apart, which hides doubles among them. But all its pixels send at the same few times, and a double has one of
-its own.
+its own. Where that is as many microseconds later for all, doubles share it, too, and are seen if both
+polarities have them and hardly anything else comes within hundreds of microseconds.
 """
 
 from __future__ import annotations
@@ -45,6 +46,10 @@ class DoubleSettings:
     shared: float = 0.01
     """Share of the events up to `far` before and after from which on one time is of many pixels: eight times
     what whole microseconds have by chance."""
+
+    none_later: float = 0.02
+    """Intervals from `near` to `far` per interval below `near`, at most, for doubles at times that many
+    pixels share: times within a frame are not always so close."""
 
 
 class IntervalCounts:
@@ -190,9 +195,12 @@ def find_double_events(
 def _chance_of(intervals: IntervalCounts, some: NDArray[np.bool_]) -> float:
     """Return p of the null for some pixels, shape (H * W,); 1 if there are too few doubles."""
     s, chance = intervals.settings, intervals.settings.near / intervals.settings.far
+    least = s.least * intervals.events[:, some].sum(1)
     soon, later = (int(row[0, some].sum()) for row in intervals.counts[3:])
-    if soon * (1 / chance - 1) < s.ratio * later:
-        return 1.0  # fast, but no faster than fast
-    if not soon or soon < s.least * intervals.events[0, some].sum():
-        return 1.0  # others have caught up with each other
+    if soon * (1 / chance - 1) < s.ratio * later or not soon or soon < least[0]:
+        # fast, but no faster than fast, or others have caught up with each other, or times are shared
+        soon, later = (int(row[0, some].sum()) for row in intervals.counts[1:3])
+        near, far = (row[:, some].sum(1) for row in intervals.counts[1:3])
+        if np.any(near < np.maximum(least, 1)) or np.any(far > s.none_later * near):
+            return 1.0
     return float(stats.binom.sf(soon - 1, soon + later, chance))

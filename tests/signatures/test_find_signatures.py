@@ -361,6 +361,21 @@ def test_events_at_parts_of_a_frame_are_not_double(rng, most):
     assert not dase.find_signatures(in_turn(rng, 0.0, most))["double events"].found
 
 
+@pytest.mark.parametrize(("after", "shown"), [((4,), True), ((12, 52), False), ((4, 40), False)])
+def test_doubles_show_that_come_as_soon_after_each_frame_for_all_pixels(rng, after, shown):
+    """A simulator's pixels send at its frames of 2.5 ms alone; parts of a frame would go on after 20 us."""
+    frame, pixel = np.repeat(np.arange(200), 150), rng.integers(0, 900, 200 * 150)
+    t = 2500.0 * frame
+    again = rng.permutation(np.flatnonzero(rng.random(len(t)) < 0.1))
+    which = np.concatenate([np.arange(len(t)), *(again[: len(again) // 2**n] for n in range(len(after)))])
+    late = np.concatenate([0 * t, *(np.full(len(again) // 2**n, late) for n, late in enumerate(after))])
+    t, pixel, on = t[which] + late, pixel[which], pixel[which] % 3 > 0
+    order = np.argsort(t, kind="stable")
+    x, y = ((pixel[order] % 30).astype(np.uint16), (pixel[order] // 30).astype(np.uint16))
+    events = Events(t[order] * 1e-6, x, y, on[order], 30, 30)
+    assert dase.find_signatures(events)["double events"].found == shown
+
+
 @pytest.mark.parametrize("seed", range(4))
 def test_noise_in_step_with_two_tones_is_no_lamp(seed):
     """A hash in place of random numbers gives noise times in common: 310 Hz, and 155 Hz half as strong."""
