@@ -18,7 +18,7 @@ from dase.diagnosis.remainder import describe_unexplained, share_of_scene, what_
 from dase.diagnosis.seen_effects import SeenEffects, part_to_simulate, without_the_explained
 from dase.diagnosis.state import DiagnosisState, DiagnosisTask, SearchPath, with_same_freedom
 from dase.fitting.confidence_intervals import estimate_parameters
-from dase.fitting.measurement import Measurement
+from dase.fitting.measurement import Measurement, with_lens
 from dase.fitting.model import FittedModel, refit_model
 from dase.fitting.plain_numbers import plain_numbers
 from dase.fitting.search_ends import parameters_at_bounds
@@ -67,7 +67,8 @@ def conclude_diagnosis(
         judged_effects = grade_effects(
             task, path, model, order, way, first, last, report=report, values=values, at_bounds=at_bounds
         )
-        judged_effects = doubt_delays_within_frames(judged_effects, model.sensor, measurement.scene)
+        seen_through = with_lens(model.sensor, task.lens)
+        judged_effects = doubt_delays_within_frames(judged_effects, seen_through, measurement.scene)
     explained = model.sensor
     for name, one in judged_effects.items():
         # a stand-in explains nothing that the events show

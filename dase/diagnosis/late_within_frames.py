@@ -1,8 +1,9 @@
-"""Delays within the frames of a clip, beside a scan of the rows.
+"""Delays within the frames of a clip, beside a scan of the rows or a lens.
 
 A simulator that knows frames alone sends the events of one at its end, or evenly in it, up to a frame late.
 That shows in the times of its events (`dase.fitting.frame_steps`), unless a scan of the rows has moved them:
-then it looks like a latency or a low-pass.
+then it looks like a latency or a low-pass. Behind a lens, whose width is known to some per cent, light goes
+from frame to frame in a way that is not quite known, and a fast low-pass makes up for some of that.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from dataclasses import replace
 from dase.effects import Effect
 from dase.effects.bandwidth import Bandwidth
 from dase.effects.latency import Latency
+from dase.effects.optics_blur import OpticsBlur
 from dase.effects.row_scan import RowScan
 from dase.effects.second_order import SecondOrder
 from dase.fitting.frame_steps import clip_step_of
@@ -25,15 +27,17 @@ from dase.simulation.sensor import Sensor
 def doubt_delays_within_frames(
     findings: Mapping[str, Finding], sensor: Sensor, scene: Scene
 ) -> dict[str, Finding]:
-    """Return findings in which delays shorter than a frame may be something unknown, where rows are scanned.
+    """Return findings in which delays shorter than a frame may be something unknown.
+
+    They may where rows are scanned, or the clip is seen through a lens.
 
     Args:
         findings: Effect to what the search says of it.
-        sensor: The last model.
+        sensor: The last model, with the lens through which a clip is seen.
         scene: The light.
     """
     gap = clip_step_of(scene)
-    if not gap or not any(isinstance(one, RowScan) for one in sensor.effects):
+    if not gap or not any(isinstance(one, RowScan | OpticsBlur) for one in sensor.effects):
         return dict(findings)
     late = {one.name: _delay_of(one) for one in sensor.effects}
     return {

@@ -1,4 +1,4 @@
-"""What is late by less than a frame of a clip may be a simulator's habit where a scan hides it."""
+"""What is late by less than a frame of a clip may be something else where a scan hides it, or a lens is."""
 
 from __future__ import annotations
 
@@ -32,9 +32,10 @@ def graded(gap: float, grade: Grade = Grade.SUPPORTED, **effects) -> Grade:
         ("second_order", {"cutoff": 200.0, "damping": 0.7}),
     ],
 )
-def test_delays_within_a_frame_are_doubted_beside_a_scan(name, values):
+def test_delays_within_a_frame_are_doubted_beside_a_scan_or_a_lens(name, values):
     late = {name: EFFECTS[name](**values)}
     assert graded(2e-3, **late, **SCAN) is Grade.EITHER
+    assert graded(2e-3, **late, optics_blur=EFFECTS["optics_blur"](sigma=1.0)) is Grade.EITHER
     assert graded(0.5e-3, **late, **SCAN) is Grade.SUPPORTED
     assert graded(2e-3, **late) is Grade.SUPPORTED
     assert graded(2e-3, Grade.CERTAIN, **late, **SCAN) is Grade.CERTAIN
