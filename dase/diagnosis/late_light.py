@@ -200,6 +200,7 @@ def find_late_events(
     *,
     log_eps: float,
     frame_step: float = 0.0,
+    dead_time: float = 0.0,
     settings: LateLightSettings = LATE_LIGHT,
 ) -> tuple[Signature, ...]:
     """Return in which ways events are late, each with its size; none where they are not, or that is not told.
@@ -208,6 +209,8 @@ def find_late_events(
         measurement: Its light is known, and not held.
         log_eps: Added to intensities before the logarithm.
         frame_step: Time from frame to frame in step with which all events come [s]; 0 if they do not.
+        dead_time: For which a pixel is seen to send nothing after an event [s]: what is due meanwhile comes
+            up to as much later, so only what is later than that is told.
         settings: When they are late.
     """
     if is_held(measurement.scene):
@@ -228,6 +231,8 @@ def find_late_events(
     # a simulator that knows frames alone is late by a frame itself
     soonest, slowest = max(settings.soonest, 3 * frame_step), min(best.poles, default=0.0)
     if slowest > settings.fastest:
+        return ()
+    if dead_time > max(best.delay, 1 / (2 * math.pi * slowest) if slowest else 0.0):
         return ()
     if any(one is not best and one.values <= best.values for one in near):
         return ()  # a search tells more, or names both

@@ -184,7 +184,13 @@ def _look_for_late_events(
     if task.evidence.contradiction or hidden or task.given.intersection(known):
         return seen
     frame_step = task.evidence.frame_step or 0.0
-    found = find_late_events(measurement, log_eps=model.sensor.log_eps, frame_step=frame_step)
+    dead = seen.entry_of(DEAD_TIME)
+    found = find_late_events(
+        measurement,
+        log_eps=model.sensor.log_eps,
+        frame_step=frame_step,
+        dead_time=float(dead.details["period"]) if dead else 0.0,
+    )
     return replace(seen, entries=(*seen.entries, *found))
 
 

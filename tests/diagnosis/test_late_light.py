@@ -106,6 +106,13 @@ def test_a_pole_is_told_beside_a_latency_that_a_simulator_of_frames_may_have(sce
     assert not find_late_events(Measurement(late, scene), log_eps=1e-3, frame_step=2e-3)
 
 
+def test_what_comes_within_a_dead_time_is_not_told(scene):
+    """What is due in it comes at its end, as if behind a pole."""
+    measured = Measurement(late_events(scene, delay=3e-3), scene)
+    for dead_time, told_late in ((2e-3, True), (5e-3, False)):
+        assert bool(find_late_events(measured, log_eps=1e-3, dead_time=dead_time)) == told_late
+
+
 @pytest.mark.parametrize("late", [{}, {"spread": 0.2}, {"delay": 2e-4}, {"poles": (3000.0,)}])
 def test_nothing_is_told_of_what_is_not_late(scene, late):
     assert told(scene, **late) == {}
