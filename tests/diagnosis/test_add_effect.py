@@ -22,6 +22,7 @@ def test_an_effect_of_few_pixels_is_added_to_a_model_that_was_not_diagnosed(devi
     assert found.parameters["hot.share"].value > 0
 
 
+@pytest.mark.slow
 def test_a_lens_is_added_to_a_model_of_a_clip():
     scene, plain = shaken_texture(), Sensor((EFFECTS["threshold"](on=0.12, off=0.12),))
     events = dase.simulate(scene, plain.with_effect(EFFECTS["optics_blur"](sigma=2.0)), seed=1)

@@ -62,6 +62,7 @@ def test_pixels_of_a_slow_scene_have_the_frame_for_their_memory():
     assert found.errors[-1] < 0.5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("loss", [0.5, 0.0])
 def test_pixels_that_are_slower_in_the_corners_tell_of_vignetting(scene, loss):
     """A low-pass so fast that it is no finding by itself; the clip is the one before the lens."""
@@ -85,6 +86,7 @@ def test_pixels_that_are_slower_in_the_corners_tell_of_vignetting(scene, loss):
         assert estimate.low < loss < estimate.high
 
 
+@pytest.mark.slow
 def test_latency_of_more_than_a_frame_is_left_to_the_search(scene):
     """After which frame an event is late its delay does not tell."""
     gap = float(np.diff(scene.sample_times())[0])

@@ -106,6 +106,7 @@ def test_a_pole_is_told_beside_a_latency_that_a_simulator_of_frames_may_have(sce
     assert not find_late_events(Measurement(late, scene), log_eps=1e-3, frame_step=2e-3)
 
 
+@pytest.mark.slow
 def test_what_comes_within_a_dead_time_is_not_told(scene):
     """What is due in it comes at its end, as if behind a pole."""
     measured = Measurement(late_events(scene, delay=3e-3), scene)
