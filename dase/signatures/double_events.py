@@ -199,8 +199,8 @@ def _chance_of(intervals: IntervalCounts, some: NDArray[np.bool_]) -> float:
     soon, later = (int(row[0, some].sum()) for row in intervals.counts[3:])
     if soon * (1 / chance - 1) < s.ratio * later or not soon or soon < least[0]:
         # fast, but no faster than fast, or others have caught up with each other, or times are shared
-        soon, later = (int(row[0, some].sum()) for row in intervals.counts[1:3])
         near, far = (row[:, some].sum(1) for row in intervals.counts[1:3])
         if np.any(near < np.maximum(least, 1)) or np.any(far > s.none_later * near):
             return 1.0
+        soon, later = int(near[0]), int(far[0])
     return float(stats.binom.sf(soon - 1, soon + later, chance))

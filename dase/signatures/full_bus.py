@@ -19,6 +19,7 @@ from scipy import stats
 
 from dase.events import Events
 from dase.formatting import format_count, format_metric, format_percent, format_seconds
+from dase.signatures.calm_events import row_major_pixels
 from dase.signatures.clock import ClockCounts
 from dase.signatures.kinds import FULL_BUS
 from dase.signatures.result import Answer, Signature, judge_signature, without_answer
@@ -48,9 +49,8 @@ class BusSettings:
     wander: float = 5.0  # ticks that as many events at random must wander off at least, to be told from those
     alike: float = 0.9  # of the runs that are even, share of which must be equally fast
     own: float = 0.01  # how far from a tick, relative: converters move equal stamps apart by one
-    shortest: float = (
-        2e-8  # time for one event [s]: below, stamps were moved apart by what is just not nothing
-    )
+    shortest: float = 2e-8  # time for one event [s]: below, stamps were moved apart by next to nothing
+    others: float = 0.5  # of the events of such a run, share at least that another pixel sent before
 
 
 def _scatter_of(counts: NDArray[np.float64], chosen: NDArray[np.bool_]) -> tuple[float, int]:
@@ -85,6 +85,9 @@ def find_even_bus(first: Events, level: float, settings: BusSettings | None = No
     slack = 1.01 * np.maximum(tick, s.straight * service)
     even = (off <= slack) & (service > s.shortest) & (service * np.sqrt(s.run) >= s.wander * tick)
     even &= np.abs(service - tick) > s.own * tick
+    # a pixel that is hot sends evenly by itself
+    pixel = row_major_pixels(first)[: many * s.run].reshape(many, s.run)
+    even &= (np.diff(pixel) != 0).mean(1) >= s.others
     if not even.any():
         return None
     usual = float(np.median(service[even]))

@@ -490,6 +490,16 @@ def test_events_come_as_evenly_as_a_bus_sends_them(service):
     assert not signatures(5e-3 * bursts + rng.uniform(0, longest, len(times)))["full bus"].found
 
 
+def test_a_pixel_that_sends_evenly_is_no_bus(rng):
+    """Behind a lens cap hardly another event comes between those of a hot pixel that is regular."""
+    t = np.concatenate([np.arange(20_000) * 5e-4, rng.uniform(0, 10, 20)])
+    pixel = np.concatenate([np.full(20_000, 700), rng.integers(0, 3072, 20)])
+    order = np.argsort(t)
+    x, y = ((pixel[order] % 64).astype(np.uint16), (pixel[order] // 64).astype(np.uint16))
+    events = dase.Events(t[order], x, y, rng.random(len(t)) < 0.5, 64, 48)
+    assert not dase.find_signatures(events)["full bus"].found
+
+
 def test_stamps_made_to_increase_are_no_bus():
     """Some converters move equal stamps apart by one tick."""
     rng = np.random.default_rng(5)
