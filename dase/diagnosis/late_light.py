@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from dase.diagnosis.light_between_events import LightBetweenEvents, StepSettings
-from dase.fitting.frame_steps import is_held
+from dase.fitting.frame_steps import clip_step_of, is_held
 from dase.fitting.measurement import Measurement
 from dase.formatting import format_metric, format_percent, format_seconds
 from dase.signatures.kinds import LATE_EVENTS
@@ -236,6 +236,9 @@ def find_late_events(
         return ()
     if any(one is not best and one.values <= best.values for one in near):
         return ()  # a search tells more, or names both
+    if best.poles and 0 < best.delay < clip_step_of(measurement.scene):
+        # within a step the light is a guess: two poles of ESIM were one and 1.9 ms of the 5 between frames
+        return ()
     if 0 < best.delay < soonest:
         # whoever is late by so little, a pole that leaves next to nothing beside it is one
         if not (best.poles and frame_step and best.differ <= settings.even):

@@ -1,9 +1,10 @@
-"""Delays within the frames of a clip, beside a scan of the rows or a lens.
+"""Delays within the frames of a clip, beside a clock, a scan of the rows or a lens.
 
 A simulator that knows frames alone sends the events of one at its end, or evenly in it, up to a frame late.
-That shows in the times of its events (`dase.fitting.frame_steps`), unless a scan of the rows has moved them:
-then it looks like a latency or a low-pass. Behind a lens, whose width is known to some per cent, light goes
-from frame to frame in a way that is not quite known, and a fast low-pass makes up for some of that.
+That shows in the times of its events (`dase.fitting.frame_steps`), unless a scan of the rows has moved
+them, or a clock has rounded them: then it looks like a latency or a low-pass. Behind a lens, whose width is
+known to some per cent, light goes from frame to frame in a way that is not quite known, and a fast low-pass
+makes up for some of that.
 """
 
 from __future__ import annotations
@@ -18,10 +19,14 @@ from dase.effects.latency import Latency
 from dase.effects.optics_blur import OpticsBlur
 from dase.effects.row_scan import RowScan
 from dase.effects.second_order import SecondOrder
+from dase.effects.timestamp import Timestamp
 from dase.fitting.frame_steps import clip_step_of
 from dase.results import Finding, Grade
 from dase.scenes.scene import Scene
 from dase.simulation.sensor import Sensor
+
+COARSE_CLOCK = 0.25
+"""Share of a frame from which on the steps of a clock hide when in it a simulator sends."""
 
 
 def doubt_delays_within_frames(
@@ -29,7 +34,7 @@ def doubt_delays_within_frames(
 ) -> dict[str, Finding]:
     """Return findings in which delays shorter than a frame may be something unknown.
 
-    They may where rows are scanned, or the clip is seen through a lens.
+    They may where rows are scanned, the clock is coarse, or the clip is seen through a lens.
 
     Args:
         findings: Effect to what the search says of it.
@@ -37,7 +42,7 @@ def doubt_delays_within_frames(
         scene: The light.
     """
     gap = clip_step_of(scene)
-    if not gap or not any(isinstance(one, RowScan | OpticsBlur) for one in sensor.effects):
+    if not gap or not any(_hides_frames(one, gap) for one in sensor.effects):
         return dict(findings)
     late = {one.name: _delay_of(one) for one in sensor.effects}
     return {
@@ -46,6 +51,13 @@ def doubt_delays_within_frames(
         else one
         for name, one in findings.items()
     }
+
+
+def _hides_frames(effect: Effect, gap: float) -> bool:
+    """Return whether beside an effect it does not show how late events of frames a time apart [s] are."""
+    if isinstance(effect, Timestamp):
+        return effect.step >= COARSE_CLOCK * gap
+    return isinstance(effect, RowScan | OpticsBlur)
 
 
 def _delay_of(effect: Effect) -> float:

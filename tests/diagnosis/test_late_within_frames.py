@@ -1,4 +1,4 @@
-"""What is late by less than a frame of a clip may be something else where a scan hides it, or a lens is."""
+"""What is late by less than a frame may be something else beside a scan, a clock or a lens."""
 
 from __future__ import annotations
 
@@ -39,6 +39,13 @@ def test_delays_within_a_frame_are_doubted_beside_a_scan_or_a_lens(name, values)
     assert graded(0.5e-3, **late, **SCAN) is Grade.SUPPORTED
     assert graded(2e-3, **late) is Grade.SUPPORTED
     assert graded(2e-3, Grade.CERTAIN, **late, **SCAN) is Grade.CERTAIN
+
+
+def test_delays_within_a_frame_are_doubted_beside_a_coarse_clock():
+    """DVSModel and v2e with stamps of 1 and 0.5 ms had a low-pass of 480 Hz and a latency of 0.45 ms."""
+    late = {"latency": EFFECTS["latency"](delay=1e-3)}
+    for step, grade in ((1e-3, Grade.EITHER), (5e-4, Grade.EITHER), (1e-6, Grade.SUPPORTED)):
+        assert graded(2e-3, **late, timestamp=EFFECTS["timestamp"](jitter=0.0, step=step)) is grade
 
 
 def test_what_makes_nothing_late_is_not_doubted():
