@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from dase.diagnosis.blurred_lens import EFFECT as LENS
-from dase.diagnosis.blurred_lens import seen_through_a_lens
+from dase.diagnosis.blurred_lens import rules_out_lens, seen_through_a_lens
 from dase.diagnosis.candidates import (
     Candidate,
     calibrate_split,
@@ -66,11 +66,7 @@ def search_effects(
     task = state.task  # the measurement is split no more
     if most > 0 and not reaches_floor(judgement) and LENS in task.effects:
         task.progress("looking at the lens", 0.0, judgement.error)
-        known = task.given | state.path.certain
-        first = [one.model for one in state.path.first]
-        state.other_scene = seen_through_a_lens(
-            compared.measurement, model, judgement.error, known, first, compared.split, seed=task.seed
-        )
+        state.other_scene = _through_a_lens(state, compared, model, judgement)
         if state.other_scene is not None:
             return model, judgement
     if not _is_enough(task, judgement) and most > 1:
@@ -90,6 +86,19 @@ def search_effects(
     model, judgement = _fit_beyond_the_search(task, model, judgement)
     state.other_scene = _known_at_frames(state, compared, model, judgement)
     return model, judgement
+
+
+def _through_a_lens(
+    state: DiagnosisState, compared: ComparedMeasurement, model: FittedModel, judgement: Judgement
+) -> Measurement | None:
+    """Return the measurement with its clip behind a lens, if that explains more of it."""
+    task = state.task
+    if rules_out_lens(compared.measurement, log_eps=compared.given.log_eps):
+        return None
+    known, first = task.given | state.path.certain, [one.model for one in state.path.first]
+    return seen_through_a_lens(
+        compared.measurement, model, judgement.error, known, first, compared.split, seed=task.seed
+    )
 
 
 def _known_at_frames(

@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,6 +42,12 @@ class LateLightSettings:
 
     quick: tuple[tuple[float, ...], tuple[float, ...]] = ((1e-3, 3e-3, 8e-3), (20.0, 80.0))
     """Latencies [s] and poles [Hz] that are looked at first."""
+
+    few: int = 12_000
+    """Events that tell where ways are; all of them tell which leaves least."""
+
+    open: float = 1.15
+    """Times what steps differ by in the best way, so far, that they do in those that all pixels look at."""
 
     begun: float = 0.93
     """Share of what steps differ by that they do with the best of these, at most, for others to be sought."""
@@ -118,7 +124,7 @@ class _Steps:
         pixel: Of each event, shape (N,).
         t: Its time [s], shape (N,).
         on: Whether it is ON, shape (N,).
-        darkest: Log intensity from which on events count.
+        brightest: Log intensity of full light; but one per cent is darker.
         settings: What counts.
     """
 
@@ -127,7 +133,7 @@ class _Steps:
     pixel: NDArray[np.int64]
     t: Array
     on: NDArray[np.bool_]
-    darkest: float
+    brightest: float
     settings: LateLightSettings
 
     @classmethod
@@ -139,9 +145,9 @@ class _Steps:
         pixel = (events.y.astype(np.int64) - first) * events.width + events.x
         order = np.lexsort((events.t, pixel))
         level = np.asarray(light.level, np.float32)
-        darkest = float(np.quantile(level, 0.99)) + math.log(light.settings.darkest)
+        brightest = float(np.quantile(level, 0.99))
         on = np.asarray(events.p, bool)[order]
-        return cls(level, light.times, pixel[order], events.t[order], on, darkest, settings)
+        return cls(level, light.times, pixel[order], events.t[order], on, brightest, settings)
 
     def differ(self, level: Levels, delay: float = 0.0) -> float:
         """Return what steps differ by: half of what two thirds lie in, relative to their median.
@@ -152,14 +158,14 @@ class _Steps:
             level: The light that pixels see, shape (T, P).
             delay: How much earlier than its event a pixel decides [s].
         """
-        t = self.t - delay
+        t, darkest = self.t - delay, self.brightest + math.log(LOOKED_AT.darkest)
         at = np.clip(np.searchsorted(self.times, t, side="right") - 1, 0, len(self.times) - 2)
         share = np.clip((t - self.times[at]) / (self.times[at + 1] - self.times[at]), 0.0, 1.0)
         before, after = level[at, self.pixel], level[at + 1, self.pixel]
         here = before + (after - before) * share
         step, gap = np.diff(here), np.diff(self.t)
         counts = (self.pixel[1:] == self.pixel[:-1]) & (self.on[1:] == self.on[:-1])
-        counts &= (gap > 0) & (gap < self.settings.longest) & (np.minimum(here[1:], here[:-1]) > self.darkest)
+        counts &= (gap > 0) & (gap < self.settings.longest) & (np.minimum(here[1:], here[:-1]) > darkest)
         out = []
         for on in (True, False):
             moved = step[counts & (self.on[1:] == on)] * (1 if on else -1)
@@ -169,11 +175,18 @@ class _Steps:
             out.append(float(high - low) / 2 / float(middle) if middle > 0 else math.inf)
         return float(np.mean(out)) if out else math.inf
 
+    def of_few(self) -> _Steps:
+        """Return those of as many pixels, across all, as tell where ways are."""
+        every = max(len(self.t) // self.settings.few, 1)
+        mine = self.pixel % every == 0
+        level = np.ascontiguousarray(self.level[:, ::every])
+        return replace(self, level=level, pixel=self.pixel[mine] // every, t=self.t[mine], on=self.on[mine])
+
     @cached_property
     def light(self) -> Levels:
         """Intensity half way between instants, relative to the brightest, shape (T - 1, P)."""
         between = 0.5 * (self.level[:-1] + self.level[1:])
-        out: Levels = np.exp(between - np.float32(np.quantile(self.level, 0.99)))
+        out: Levels = np.exp(between - np.float32(self.brightest))
         return out
 
     def behind_pole(self, cutoff: float, dark: float, level: Levels | None = None) -> Levels:
@@ -257,38 +270,55 @@ def _looks_late(steps: _Steps, at_once: float, settings: LateLightSettings) -> b
 
 def _ways_of(steps: _Steps, settings: LateLightSettings) -> list[Way]:
     """Return the best latency, pole, two poles, and pole with a latency."""
-
-    def dark_of(log: float) -> float:
-        return min(math.exp(log), settings.most_dark)
-
+    few = steps.of_few()
     low, high, count = settings.delays
-    begin = min(np.geomspace(low, high, count), key=lambda delay: steps.differ(steps.level, delay))
-    differ, logs = _least(lambda q: steps.differ(steps.level, math.exp(q[0])), [math.log(begin)], [0.15], 12)
-    latency = Way(differ, delay=math.exp(logs[0]))
-
-    def pole(logs: Sequence[float]) -> float:
-        return steps.differ(steps.behind_pole(math.exp(logs[0]), dark_of(logs[1])))
-
+    begin = min(np.geomspace(low, high, count), key=lambda delay: few.differ(few.level, delay))
+    found = {"latency": _least(partial(_differ, few, "latency"), [math.log(begin)], [0.15], 12)}
     low, high, count = settings.poles
     starts = [(math.log(f), math.log(d)) for f in np.geomspace(low, high, count) for d in settings.darks]
-    differ, logs = _least(pole, min(starts, key=pole), [0.25, 0.8], 22)
-    slow = math.exp(logs[0])
-    one = Way(differ, poles=(slow,))
+    pole = partial(_differ, few, "pole")
+    found["pole"] = _least(pole, min(starts, key=pole), [0.25, 0.8], 22)
+    first, dark = found["pole"][1]
+    begins = {"poles": [first + 0.5, dark, 0.3]}
+    begins["late pole"] = [first + 0.4, dark, math.log(0.3 / (2 * math.pi)) - first]
+    for kind, logs in begins.items():
+        spread = [0.25, 0.8, 0.3 if kind == "poles" else 0.6]
+        found[kind] = _least(partial(_differ, few, kind), logs, spread, 32)
+    most = settings.open * min(differ for differ, _ in found.values())
+    out = []
+    for kind, (differ, logs) in found.items():
+        whole = partial(_differ, steps, kind)
+        if differ <= most and few is not steps:
+            differ, logs = _least(whole, logs, [0.06, 0.2, 0.1][: len(logs)], 3 * len(logs))
+        else:
+            differ = whole(logs)
+        out.append(_way_at(kind, logs, differ))
+    return out
 
-    def poles(logs: Sequence[float]) -> float:
-        dark, first, apart = dark_of(logs[2]), math.exp(logs[0]), math.exp(abs(logs[1]))
-        return steps.differ(steps.behind_pole(first * apart, dark, steps.behind_pole(first, dark)))
 
-    differ, both = _least(poles, [logs[0] + 0.5, 0.3, logs[1]], [0.25, 0.3, 0.8], 32)
-    ends = (math.exp(both[0]), math.exp(both[0] + abs(both[1])))
-    two = Way(differ, poles=ends)
+def _way_at(kind: str, logs: Sequence[float], differ: float = math.nan) -> Way:
+    """Return a way.
 
-    def late_pole(logs: Sequence[float]) -> float:
-        return steps.differ(steps.behind_pole(math.exp(logs[0]), dark_of(logs[2])), math.exp(logs[1]))
+    Args:
+        kind: "latency", "pole", "poles" or "late pole".
+        logs: Of the latency [s]; or of the first pole [Hz] and the dark current, and of how many times faster
+            the other pole is, or of the latency.
+        differ: What steps then differ by.
+    """
+    first = math.exp(logs[0])
+    if kind == "latency":
+        return Way(differ, delay=first)
+    if kind == "late pole":
+        return Way(differ, delay=math.exp(logs[2]), poles=(first,))
+    return Way(differ, poles=(first,) if kind == "pole" else (first, first * math.exp(abs(logs[2]))))
 
-    lag = math.log(0.3 / (2 * math.pi * slow))
-    differ, both = _least(late_pole, [logs[0] + 0.4, lag, logs[1]], [0.25, 0.6, 0.8], 32)
-    return [latency, one, two, Way(differ, math.exp(both[1]), (math.exp(both[0]),))]
+
+def _differ(steps: _Steps, kind: str, logs: Sequence[float]) -> float:
+    """Return what steps differ by if events are late in a way, see `_way_at`."""
+    way, seen = _way_at(kind, logs), steps.level
+    for cutoff in way.poles:
+        seen = steps.behind_pole(cutoff, min(math.exp(logs[1]), steps.settings.most_dark), seen)
+    return steps.differ(seen, way.delay)
 
 
 def _least(

@@ -236,15 +236,33 @@ def fit_present_model(
     evidence: SplitMeasurement, sensor: Sensor, free: Sequence[str] | None, *, seed: int
 ) -> FittedModel:
     """Fit the free parameters of a sensor: a wide look at thresholds and phase, then descents."""
+    best = _look_at_thresholds(evidence, sensor, free, seed=seed)
+    # each was judged by its own sampling errors; judge both by those of the better one
+    half = best[0].calibrate(evidence.train, repeats=12, seed=SimulationStream.CALIBRATE_FIT.seed(seed))
+    ends = run_side_by_side([m.search_work(half, seed=seed) for m in best])
+    return refit_model(evidence, min(ends, key=lambda m: m.loss), seed=seed, rounds=1)
+
+
+def fit_roughly(
+    evidence: SplitMeasurement, sensor: Sensor, free: Sequence[str] | None, *, seed: int
+) -> FittedModel:
+    """Fit the free parameters of a sensor to few pixels: a wide look at thresholds and phase, one descent."""
+    best = _look_at_thresholds(evidence, sensor, free, seed=seed)[0]
+    half = best.calibrate(
+        evidence.scout, repeats=REFIT.repeats, seed=SimulationStream.CALIBRATE_FIT.seed(seed)
+    )
+    return run_work(best.search_work(half, seed=seed))
+
+
+def _look_at_thresholds(
+    evidence: SplitMeasurement, sensor: Sensor, free: Sequence[str] | None, *, seed: int
+) -> list[FittedModel]:
+    """Return a model at the best of many thresholds with either phase, the better one first."""
     model = model_of(sensor, free)
     looks = [
         _threshold_scan_work(evidence.scout, with_phase(model, phase), seed=seed) for phase in (0.0, 1.0)
     ]
-    # each was judged by its own sampling errors; judge both by those of the better one
-    best = sorted(run_side_by_side(looks), key=lambda m: m.loss)
-    half = best[0].calibrate(evidence.train, repeats=12, seed=SimulationStream.CALIBRATE_FIT.seed(seed))
-    ends = run_side_by_side([m.search_work(half, seed=seed) for m in best])
-    return refit_model(evidence, min(ends, key=lambda m: m.loss), seed=seed, rounds=1)
+    return sorted(run_side_by_side(looks), key=lambda m: m.loss)
 
 
 def _threshold_scan_work(subset: PixelSubset, start: FittedModel, *, seed: int) -> Work[FittedModel]:

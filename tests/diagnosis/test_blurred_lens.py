@@ -9,7 +9,7 @@ from helpers.brief_diagnosis import NO_LIMITS
 from helpers.frame_simulator import shaken_texture
 
 import dase
-from dase.diagnosis.blurred_lens import lens_between_events
+from dase.diagnosis.blurred_lens import lens_between_events, rules_out_lens
 from dase.effects import EFFECTS
 from dase.effects.bandwidth import Bandwidth
 from dase.effects.optics_blur import OpticsBlur, blur_weights
@@ -92,6 +92,33 @@ def test_what_makes_steps_differ_is_no_lens(scene, effect):
     sensor = dase.Sensor((effect, EFFECTS["threshold"](on=0.2, off=0.22)))
     events = dase.simulate(scene, sensor, seed=1)
     assert lens_between_events(as_measurement(events, scene), log_eps=1e-3) is None
+
+
+BESIDE = {
+    "latency": {"delay": 3e-3},
+    "bandwidth": {"cutoff": 100.0},
+    "second_order": {"cutoff": 30.0},
+    "high_pass": {"cutoff": 3.0},
+    "refractory": {"period": 2e-2},
+    "jitter": {"spread": 0.3},
+    "dark": {"current": 0.1},
+    "voltage_noise": {"sigma": 0.05, "cutoff": 100.0},
+}
+
+
+@pytest.mark.parametrize("beside", BESIDE)
+@pytest.mark.parametrize("sigma", [0.5, SIGMA])
+def test_a_lens_is_not_ruled_out_whatever_is_beside_it(scene, sigma, beside):
+    events = behind_lens(scene, sigma, EFFECTS[beside](**BESIDE[beside]))
+    assert not rules_out_lens(as_measurement(events, scene), log_eps=1e-3)
+
+
+@pytest.mark.parametrize("beside", ["", "voltage_noise"])
+def test_a_lens_is_ruled_out_where_steps_differ_more_behind_any(scene, beside):
+    more = [EFFECTS[beside](**BESIDE[beside])] if beside else []
+    sensor = dase.Sensor((*more, EFFECTS["threshold"](on=0.2, off=0.22)))
+    events = dase.simulate(scene, sensor, seed=1)
+    assert rules_out_lens(as_measurement(events, scene), log_eps=1e-3)
 
 
 @pytest.mark.slow
