@@ -22,6 +22,7 @@ from dase.diagnosis.light_between_events import LightBetweenEvents, StepSettings
 from dase.fitting.frame_steps import clip_step_of, is_held
 from dase.fitting.measurement import Measurement
 from dase.formatting import format_metric, format_percent, format_seconds
+from dase.kernels.slow_light import SlowLight
 from dase.signatures.kinds import LATE_EVENTS
 from dase.signatures.result import Answer, Signature
 
@@ -119,13 +120,14 @@ class _Steps:
     """Events of the rows that are looked at, pixel by pixel, and the light there.
 
     Args:
-        level: Log intensity, shape (T, P).
+        level: Log intensity, shape (P, T).
         times: Of the instants [s], shape (T,).
         pixel: Of each event, shape (N,).
         t: Its time [s], shape (N,).
         on: Whether it is ON, shape (N,).
         brightest: Log intensity of full light; but one per cent is darker.
         settings: What counts.
+        device: Where light is filtered.
     """
 
     level: Levels
@@ -135,77 +137,86 @@ class _Steps:
     on: NDArray[np.bool_]
     brightest: float
     settings: LateLightSettings
+    device: str
 
     @classmethod
-    def of(cls, light: LightBetweenEvents, settings: LateLightSettings) -> _Steps:
+    def of(cls, light: LightBetweenEvents, settings: LateLightSettings, device: str = "cpu") -> _Steps:
         """Return those of a measurement."""
         first, after = light.rows
         events = light.measurement.compared_events()
         events = events.select((events.y >= first) & (events.y < after))
         pixel = (events.y.astype(np.int64) - first) * events.width + events.x
         order = np.lexsort((events.t, pixel))
-        level = np.asarray(light.level, np.float32)
+        level = np.ascontiguousarray(light.level.T, np.float32)
         brightest = float(np.quantile(level, 0.99))
         on = np.asarray(events.p, bool)[order]
-        return cls(level, light.times, pixel[order], events.t[order], on, brightest, settings)
+        return cls(level, light.times, pixel[order], events.t[order], on, brightest, settings, device)
 
-    def differ(self, level: Levels, delay: float = 0.0) -> float:
+    def of_few(self) -> _Steps:
+        """Return those of as many pixels, across all, as tell where ways are."""
+        every = max(len(self.t) // self.settings.few, 1)
+        mine = self.pixel % every == 0
+        level = np.ascontiguousarray(self.level[::every])
+        return replace(self, level=level, pixel=self.pixel[mine] // every, t=self.t[mine], on=self.on[mine])
+
+    def differ(self, poles: Sequence[float] = (), dark: float = 0.0, delay: float = 0.0) -> float:
         """Return what steps differ by: half of what two thirds lie in, relative to their median.
 
         Infinite where too few count.
 
         Args:
-            level: The light that pixels see, shape (T, P).
+            poles: Behind which pixels see the light: none, one or two [Hz at the brightest light].
+            dark: Current without light that adds to it, relative to the brightest.
             delay: How much earlier than its event a pixel decides [s].
         """
-        t, darkest = self.t - delay, self.brightest + math.log(LOOKED_AT.darkest)
-        at = np.clip(np.searchsorted(self.times, t, side="right") - 1, 0, len(self.times) - 2)
-        share = np.clip((t - self.times[at]) / (self.times[at + 1] - self.times[at]), 0.0, 1.0)
-        before, after = level[at, self.pixel], level[at + 1, self.pixel]
+        level = self._slow_light.behind(poles, dark) if poles else self.level
+        index, share = self._places(delay) if delay else self._places_at_once
+        before, after = level.ravel()[index], level.ravel()[index + 1]
         here = before + (after - before) * share
-        step, gap = np.diff(here), np.diff(self.t)
-        counts = (self.pixel[1:] == self.pixel[:-1]) & (self.on[1:] == self.on[:-1])
-        counts &= (gap > 0) & (gap < self.settings.longest) & (np.minimum(here[1:], here[:-1]) > darkest)
+        darkest = self.brightest + math.log(LOOKED_AT.darkest)
         out = []
-        for on in (True, False):
-            moved = step[counts & (self.on[1:] == on)] * (1 if on else -1)
+        for last, sign in self._pairs:
+            now, then = here[last], here[last - 1]
+            moved = (sign * (now - then))[np.minimum(now, then) > darkest]
             if len(moved) < self.settings.least:
                 continue
             low, middle, high = np.quantile(moved, [0.16, 0.5, 0.84])
             out.append(float(high - low) / 2 / float(middle) if middle > 0 else math.inf)
         return float(np.mean(out)) if out else math.inf
 
-    def of_few(self) -> _Steps:
-        """Return those of as many pixels, across all, as tell where ways are."""
-        every = max(len(self.t) // self.settings.few, 1)
-        mine = self.pixel % every == 0
-        level = np.ascontiguousarray(self.level[:, ::every])
-        return replace(self, level=level, pixel=self.pixel[mine] // every, t=self.t[mine], on=self.on[mine])
-
-    @cached_property
-    def light(self) -> Levels:
-        """Intensity half way between instants, relative to the brightest, shape (T - 1, P)."""
-        between = 0.5 * (self.level[:-1] + self.level[1:])
-        out: Levels = np.exp(between - np.float32(self.brightest))
-        return out
-
-    def behind_pole(self, cutoff: float, dark: float, level: Levels | None = None) -> Levels:
-        """Return the light behind a pole that goes with it, exact where it runs straight, shape (T, P).
+    def _places(self, delay: float) -> tuple[NDArray[np.int64], Levels]:
+        """Return where in the light events were decided: the instant before, and how far on to the next.
 
         Args:
-            cutoff: At the brightest light [Hz].
-            dark: Current without light that adds to it, relative to the brightest.
-            level: Log intensity that it filters, shape (T, P); None for that of the scene.
+            delay: How much earlier than its event a pixel decides [s].
+
+        Returns:
+            Row-major index, shape (N,), and share of the way, shape (N,).
         """
-        seen = self.level if level is None else level
-        out = np.empty_like(seen)
-        now = out[0] = seen[0]
-        for n, gap in enumerate(np.diff(self.times)):
-            x = np.maximum((2 * np.pi * cutoff * gap / (1 + dark)) * (self.light[n] + dark), 1e-6)
-            decay = np.exp(-x)
-            now = seen[n + 1] - (seen[n + 1] - seen[n]) * ((1 - decay) / x) + (now - seen[n]) * decay
-            out[n + 1] = now
-        return out
+        t = self.t - delay
+        at = np.clip(np.searchsorted(self.times, t, side="right") - 1, 0, len(self.times) - 2)
+        share = np.clip((t - self.times[at]) / (self.times[at + 1] - self.times[at]), 0.0, 1.0)
+        return self.pixel * len(self.times) + at, share.astype(np.float32)
+
+    @cached_property
+    def _places_at_once(self) -> tuple[NDArray[np.int64], Levels]:
+        return self._places(0.0)
+
+    @cached_property
+    def _pairs(self) -> list[tuple[NDArray[np.int64], int]]:
+        """Events that follow one of the same pixel and polarity soon, of ON and of OFF, and the sign."""
+        gap = np.diff(self.t)
+        counts = (self.pixel[1:] == self.pixel[:-1]) & (self.on[1:] == self.on[:-1])
+        counts &= (gap > 0) & (gap < self.settings.longest)
+        return [
+            (1 + np.flatnonzero(counts & (self.on[1:] == on)), sign) for on, sign in ((True, 1), (False, -1))
+        ]
+
+    @cached_property
+    def _slow_light(self) -> SlowLight:
+        between = 0.5 * (self.level[:, :-1] + self.level[:, 1:])
+        light = np.exp(between - np.float32(self.brightest))
+        return SlowLight(self.level, light, self.times, self.device)
 
 
 def find_late_events(
@@ -214,6 +225,7 @@ def find_late_events(
     log_eps: float,
     frame_step: float = 0.0,
     dead_time: float = 0.0,
+    device: str = "cpu",
     settings: LateLightSettings = LATE_LIGHT,
 ) -> tuple[Signature, ...]:
     """Return in which ways events are late, each with its size; none where they are not, or that is not told.
@@ -224,6 +236,7 @@ def find_late_events(
         frame_step: Time from frame to frame in step with which all events come [s]; 0 if they do not.
         dead_time: For which a pixel is seen to send nothing after an event [s]: what is due meanwhile comes
             up to as much later, so only what is later than that is told.
+        device: Where light is filtered.
         settings: When they are late.
     """
     if is_held(measurement.scene):
@@ -231,8 +244,8 @@ def find_late_events(
     light = LightBetweenEvents.of(measurement, log_eps=log_eps, settings=LOOKED_AT)
     if light is None:
         return ()
-    steps = _Steps.of(light, settings)
-    at_once = steps.differ(steps.level)
+    steps = _Steps.of(light, settings, device)
+    at_once = steps.differ()
     if not math.isfinite(at_once) or not _looks_late(steps, at_once, settings):
         return ()
     ways = _ways_of(steps, settings)
@@ -263,8 +276,8 @@ def find_late_events(
 def _looks_late(steps: _Steps, at_once: float, settings: LateLightSettings) -> bool:
     """Return whether some latency or pole makes steps more alike."""
     delays, poles = settings.quick
-    looks = [steps.differ(steps.level, delay) for delay in delays]
-    looks += [steps.differ(steps.behind_pole(pole, settings.darks[-1])) for pole in poles]
+    looks = [steps.differ(delay=delay) for delay in delays]
+    looks += [steps.differ([pole], settings.darks[-1]) for pole in poles]
     return min(looks) < settings.begun * at_once
 
 
@@ -272,7 +285,7 @@ def _ways_of(steps: _Steps, settings: LateLightSettings) -> list[Way]:
     """Return the best latency, pole, two poles, and pole with a latency."""
     few = steps.of_few()
     low, high, count = settings.delays
-    begin = min(np.geomspace(low, high, count), key=lambda delay: few.differ(few.level, delay))
+    begin = min(np.geomspace(low, high, count), key=lambda delay: few.differ(delay=delay))
     found = {"latency": _least(partial(_differ, few, "latency"), [math.log(begin)], [0.15], 12)}
     low, high, count = settings.poles
     starts = [(math.log(f), math.log(d)) for f in np.geomspace(low, high, count) for d in settings.darks]
@@ -315,10 +328,9 @@ def _way_at(kind: str, logs: Sequence[float], differ: float = math.nan) -> Way:
 
 def _differ(steps: _Steps, kind: str, logs: Sequence[float]) -> float:
     """Return what steps differ by if events are late in a way, see `_way_at`."""
-    way, seen = _way_at(kind, logs), steps.level
-    for cutoff in way.poles:
-        seen = steps.behind_pole(cutoff, min(math.exp(logs[1]), steps.settings.most_dark), seen)
-    return steps.differ(seen, way.delay)
+    way = _way_at(kind, logs)
+    dark = min(math.exp(logs[1]), steps.settings.most_dark) if way.poles else 0.0
+    return steps.differ(way.poles, dark, way.delay)
 
 
 def _least(

@@ -190,6 +190,7 @@ def _look_for_late_events(
         log_eps=model.sensor.log_eps,
         frame_step=frame_step,
         dead_time=float(dead.details["period"]) if dead else 0.0,
+        device=str(task.evidence.train.trials.device),
     )
     return replace(seen, entries=(*seen.entries, *found))
 
