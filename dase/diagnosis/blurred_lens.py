@@ -57,14 +57,14 @@ class LensSettings:
     """The same where one effect stays: 0.1 to 0.2 where there was a lens, 0.6 and more where something was
     missing that the library has not."""
 
-    others: int = 3
-    """Effects beside which a lens is tried, one at a time."""
+    others: int = 6
+    """Effects beside which a lens is tried, one at a time, by rough fits; beside one it is fitted well."""
 
     worth: float = 2.0
     """What is left after a coarser look, in units of what may be left, with which finer ones go on."""
 
     roughly: float = 1.25
-    """The same after a rough fit, with which others follow."""
+    """What a rough fit may leave, in units of what may be left, for a good one to follow."""
 
     repeats: int = 12
     """Simulations that judge."""
@@ -285,8 +285,11 @@ def seen_through_a_lens(
         return error_of_choice(seen_behind(width), fitted, seed=seed)
 
     @cache
+    def left_roughly(which: int, width: float) -> float:
+        return _rough_error(seen_behind(width), *tried[which], seed=seed)
+
     def left_at_first(which: int) -> float:
-        return min(_quick_error(seen_behind(w), *tried[which], seed=seed) for w in settings.widths)
+        return min(left_roughly(which, width) for width in settings.widths)
 
     share = settings.better if bare == model.sensor else settings.simpler
 
@@ -296,15 +299,17 @@ def seen_through_a_lens(
             yield min(range(1, len(tried)), key=left_at_first), settings.beside * error
 
     for which, most in ways():
-        if left_at_first(which) > settings.roughly * most:
+        near = best_width(partial(left_roughly, which), settings.roughly * most, settings)
+        if near is None:
             continue
-        width = best_width(partial(left, which), most, settings)
+        closely = replace(settings, widths=(near,), finer=settings.finer[-1:])
+        width = best_width(partial(left, which), most, closely)
         if width is not None:
             return behind_lens(measurement, width)
     return None
 
 
-def _quick_error(evidence: SplitMeasurement, sensor: Sensor, free: Sequence[str], *, seed: int) -> float:
+def _rough_error(evidence: SplitMeasurement, sensor: Sensor, free: Sequence[str], *, seed: int) -> float:
     """Return about the error that a model leaves on the part that chooses, fitted to few pixels."""
     fitted = fit_roughly(evidence, sensor, free, seed=seed)
     return fitted.judge(evidence.held, repeats=4, seed=SimulationStream.JUDGE.seed(seed)).error
