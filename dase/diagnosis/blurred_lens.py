@@ -69,6 +69,9 @@ class LensSettings:
     repeats: int = 12
     """Simulations that judge."""
 
+    few_repeats: int = 4
+    """Those that judge a rough fit."""
+
     octaves: tuple[float, float, float] = (-2.0, 1.5, 0.5)
     """Widths behind which steps from event to event are compared: from, to, and apart [octaves of 1.2 px]."""
 
@@ -153,8 +156,7 @@ def lens_between_events(
 
     def differ(width: float) -> tuple[float, float]:
         seen = behind_lens(measurement, width) if width else measurement
-        light = LightBetweenEvents.of(seen, log_eps=log_eps)
-        return (math.inf, math.inf) if light is None else _differences(light.seen, settings)
+        return _differ_between_events(seen, log_eps, settings)
 
     sharp = differ(0.0)
     if not all(math.isfinite(one) for one in sharp):
@@ -188,18 +190,14 @@ def rules_out_lens(measurement: Measurement, *, log_eps: float, settings: LensSe
         log_eps: Added to intensities before the logarithm.
         settings: Which widths are looked at.
     """
-
-    def differ(seen: Measurement) -> tuple[float, float]:
-        light = LightBetweenEvents.of(seen, log_eps=log_eps)
-        return (math.inf, math.inf) if light is None else _differences(light.seen, settings)
-
     scene = measurement.scene
     if not isinstance(scene, VideoScene) or scene.sharp is not None or scene.held_for:
         return False
-    sharp = differ(measurement)
-    if not max(sharp) <= settings.tells:
+    sharp = _differ_between_events(measurement, log_eps, settings)
+    if max(sharp) > settings.tells:
         return False
-    behind = (differ(behind_lens(measurement, 1.2 * 2**at)) for at in settings.ruled_out)
+    lenses = (behind_lens(measurement, 1.2 * 2**at) for at in settings.ruled_out)
+    behind = (_differ_between_events(seen, log_eps, settings) for seen in lenses)
     return all(b > a for both in behind for a, b in zip(sharp, both, strict=True))
 
 
@@ -217,6 +215,14 @@ def _is_lens(sharp: tuple[float, float], behind: tuple[float, float], settings: 
 def _ratio(sharp: tuple[float, float], behind: tuple[float, float]) -> float:
     """Return what steps differ by behind a lens, relative to without it, of the polarity with more."""
     return max(b / a if 0 < a < math.inf else math.inf for a, b in zip(sharp, behind, strict=True))
+
+
+def _differ_between_events(
+    measurement: Measurement, log_eps: float, settings: LensSettings
+) -> tuple[float, float]:
+    """Return what ON and OFF steps of the light of a measurement differ by, see `_differences`."""
+    light = LightBetweenEvents.of(measurement, log_eps=log_eps)
+    return (math.inf, math.inf) if light is None else _differences(light.seen, settings)
 
 
 def _differences(steps: LightSteps, settings: LensSettings = LENS) -> tuple[float, float]:
@@ -312,7 +318,8 @@ def seen_through_a_lens(
 def _rough_error(evidence: SplitMeasurement, sensor: Sensor, free: Sequence[str], *, seed: int) -> float:
     """Return about the error that a model leaves on the part that chooses, fitted to few pixels."""
     fitted = fit_roughly(evidence, sensor, free, seed=seed)
-    return fitted.judge(evidence.held, repeats=4, seed=SimulationStream.JUDGE.seed(seed)).error
+    stream = SimulationStream.JUDGE.seed(seed)
+    return fitted.judge(evidence.held, repeats=LENS.few_repeats, seed=stream).error
 
 
 def best_width(

@@ -153,8 +153,10 @@ class _Steps:
         return cls(level, light.times, pixel[order], events.t[order], on, brightest, settings, device)
 
     def of_few(self) -> _Steps:
-        """Return those of as many pixels, across all, as tell where ways are."""
-        every = max(len(self.t) // self.settings.few, 1)
+        """Return those of as many pixels, across all, as tell where ways are; these themselves if so few."""
+        every = len(self.t) // self.settings.few
+        if every < 2:
+            return self
         mine = self.pixel % every == 0
         level = np.ascontiguousarray(self.level[::every])
         return replace(self, level=level, pixel=self.pixel[mine] // every, t=self.t[mine], on=self.on[mine])
@@ -303,7 +305,7 @@ def _ways_of(steps: _Steps, settings: LateLightSettings) -> list[Way]:
         whole = partial(_differ, steps, kind)
         if differ <= most and few is not steps:
             differ, logs = _least(whole, logs, [0.06, 0.2, 0.1][: len(logs)], 3 * len(logs))
-        else:
+        elif few is not steps:
             differ = whole(logs)
         out.append(_way_at(kind, logs, differ))
     return out
