@@ -69,7 +69,7 @@ def search_effects(
         state.other_scene = _through_a_lens(state, compared, model, judgement)
         if state.other_scene is not None:
             return model, judgement
-    if not _is_enough(task, judgement) and most > 1:
+    if not reaches_floor(judgement) and most > 1:
         model, judgement = _go_the_other_way(state, compared, model, judgement, most)
     if not reaches_floor(judgement) and most > 1:
         single = model
@@ -105,16 +105,12 @@ def _known_at_frames(
     state: DiagnosisState, compared: ComparedMeasurement, model: FittedModel, judgement: Judgement
 ) -> Measurement | None:
     """Return the measurement with its clip known at its frames alone, if that explains more of it."""
+    if leaves_nothing(judgement):
+        return None
     evidence, seed = state.task.evidence, state.task.seed
     return known_at_frames_alone(
         compared.measurement, evidence, model, judgement.error, compared.split, seed=seed
     )
-
-
-def _is_enough(task: DiagnosisTask, judgement: Judgement) -> bool:
-    """Whether another way would lead no farther; what guessed light leaves does not say that it would."""
-    guessed = task.evidence.held.doubt is not None
-    return reaches_floor(judgement) if guessed else leaves_nothing(judgement)
 
 
 def _go_the_other_way(
@@ -122,13 +118,12 @@ def _go_the_other_way(
 ) -> tuple[FittedModel, Judgement]:
     """Add one effect after the other once more, beginning with the one that came next in the first step.
 
-    What stands in for two effects may leave less than either, and hides what shows beside the right one. A
-    way that has reached the floor is left only for one that leaves no more than chance may.
+    What stands in for two effects may leave less than either, and hides what shows beside the right one.
 
     Args:
         state: Its path becomes that of this way, where it is the better one.
         compared: The measurement.
-        model: The last one of the first way.
+        model: The last one of the first way, above the floor.
         judgement: Its held-out error.
         most: Effects that are added at most.
     """
@@ -151,12 +146,8 @@ def _go_the_other_way(
     state.note_addition(other, [one for one in path.first if one.judgement], task.judge(start))
     begin = refit_model(task.evidence, other.model, seed=task.seed, rounds=1)
     found, judged = _add_one_by_one(state, compared, begin, _left_to_add(task, begin, most))
-    if reaches_floor(judgement):
-        better = explains_remainder(judged, judgement, settings)
-    else:
-        gain = 1.0 if reaches_floor(judged) else settings.pair_gain
-        better = judged.error < gain * judgement.error
-    if better:
+    gain = 1.0 if reaches_floor(judged) else settings.pair_gain
+    if judged.error < gain * judgement.error:
         return found, judged
     state.go_back(path)
     return model, judgement

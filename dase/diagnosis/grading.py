@@ -306,7 +306,8 @@ def _rivals_to_try(
     """Return the candidates that did nearly as well when an effect was added.
 
     One that includes the effect as a special case is none, for the simpler of the two is said; but where
-    something unknown may look like the simple one, that may well be the other.
+    something unknown may look like the simple one, that may well be the other, and so it may where the other
+    left clearly less.
 
     Args:
         task: What the diagnosis is asked.
@@ -318,7 +319,9 @@ def _rivals_to_try(
     settings, out = task.settings.grades, list[Candidate]()
     for other in path.alternatives.get(name, []):
         includes = name in task.effects[other.name].includes if other.name in task.effects else False
-        if other.name in model.space.sensor or (includes and not doubtful) or other.judgement is None:
+        clearly = other.error < path.error_of.get(name, 0.0) - settings.includer_better
+        includes = includes and not doubtful and not clearly
+        if other.name in model.space.sensor or includes or other.judgement is None:
             continue
         level = max(other.judgement.level, settings.usual)
         near = settings.rival * max(path.error_of.get(name, 0.0) - level, 0.0) + settings.tie

@@ -16,6 +16,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
+from dase.diagnosis.candidates import scout_of
 from dase.diagnosis.dead_time import find_dead_time, intervals_of
 from dase.diagnosis.grading import grade_of, judge_on_report
 from dase.diagnosis.state import DiagnosisTask, with_same_freedom
@@ -27,8 +28,9 @@ from dase.fitting.data_split import SplitMeasurement
 from dase.fitting.frame_steps import clip_step_of
 from dase.fitting.held_clips import begin_of_events
 from dase.fitting.measurement import Measurement, note_of_held_frames
-from dase.fitting.model import FittedModel, fit_present_model, refit_model
+from dase.fitting.model import FittedModel, fit_present_model, refit_model, refit_work
 from dase.fitting.parameter_space import axes_of
+from dase.fitting.scheduler import run_side_by_side
 from dase.formatting import format_seconds
 from dase.probes.random_streams import SimulationStream
 from dase.probes.stimulus import STIMULUS
@@ -55,6 +57,9 @@ class HeldFrameSettings:
     by_frames: float = 0.7
     """Share of the error of a last model with a low-pass that one from frame to frame leaves, at most."""
 
+    roughly: float = 1.5
+    """What such a low-pass may leave after a fit to few pixels, in units of that, for a full one."""
+
     at_once: float = 0.1
     """Times after a frame, relative to that to the next, at which events are not late."""
 
@@ -63,6 +68,9 @@ class HeldFrameSettings:
 
     repeats: int = 12
     """Simulations that judge."""
+
+    few_repeats: int = 4
+    """Those that judge a fit to few pixels."""
 
     missing: float = 3.0
     """Error of the model before the search below which no low-pass is looked for that hides jumps."""
@@ -254,10 +262,16 @@ def known_at_frames_alone(
     shown = scene.known_at_frames()
     again = split(shown)
     stream = SimulationStream.JUDGE.seed(seed)
-    for one in _in_steps(slow):
-        way = with_same_freedom(rest.with_effect(one), model, [one.name])
+    ways = [with_same_freedom(rest.with_effect(one), model, [one.name]) for one in _in_steps(slow)]
+    most = settings.by_frames * error
+    # most clips are filtered in time: a fit to few pixels is enough to see that
+    rough = run_side_by_side([refit_work(scout_of(again), way, seed=seed, rounds=1) for way in ways])
+    for way, near in zip(ways, rough, strict=True):
+        left = near.judge(again.held, repeats=settings.few_repeats, seed=stream).error
+        if left > settings.roughly * most:
+            continue
         fitted = refit_model(again, way, seed=seed)
-        if fitted.judge(again.held, repeats=settings.repeats, seed=stream).error < settings.by_frames * error:
+        if fitted.judge(again.held, repeats=settings.repeats, seed=stream).error < most:
             note = "a low-pass from frame to frame of the clip leaves far less than one in time"
             return replace(measurement, scene=shown, notes=(*measurement.notes, note))
     return None

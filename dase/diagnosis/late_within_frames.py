@@ -2,9 +2,10 @@
 
 A simulator that knows frames alone sends the events of one at its end, or evenly in it, up to a frame late.
 That shows in the times of its events (`dase.fitting.frame_steps`), unless a scan of the rows has moved
-them, or a clock has rounded them: then it looks like a latency or a low-pass. Behind a lens, whose width is
-known to some per cent, light goes from frame to frame in a way that is not quite known, and a fast low-pass
-makes up for some of that.
+them, or a clock has rounded them: then it looks like a latency or a low-pass. Nor is it known whether the
+clock of a simulator shows the tick before an event, as a camera's does, or the one after it, a tick later.
+Behind a lens, whose width is known to some per cent, light goes from frame to frame in a way that is not
+quite known, and a fast low-pass makes up for some of that.
 """
 
 from __future__ import annotations
@@ -32,9 +33,10 @@ COARSE_CLOCK = 0.25
 def doubt_delays_within_frames(
     findings: Mapping[str, Finding], sensor: Sensor, scene: Scene
 ) -> dict[str, Finding]:
-    """Return findings in which delays shorter than a frame may be something unknown.
+    """Return findings in which delays shorter than a frame or a tick of the clock may be something unknown.
 
-    They may where rows are scanned, the clock is coarse, or the clip is seen through a lens.
+    Those shorter than a frame may where rows are scanned, the clock is coarse, or the clip is seen through a
+    lens.
 
     Args:
         findings: Effect to what the search says of it.
@@ -42,12 +44,15 @@ def doubt_delays_within_frames(
         scene: The light.
     """
     gap = clip_step_of(scene)
-    if not gap or not any(_hides_frames(one, gap) for one in sensor.effects):
+    if not gap:
         return dict(findings)
+    tick = max((one.step for one in sensor.effects if isinstance(one, Timestamp)), default=0.0)
+    hidden = gap if any(_hides_frames(one, gap) for one in sensor.effects) else 0.0
+    shortest = max(hidden, tick)
     late = {one.name: _delay_of(one) for one in sensor.effects}
     return {
         name: replace(one, grade=Grade.EITHER, unknown=True)
-        if one.grade is Grade.SUPPORTED and 0 < late.get(name, 0.0) < gap
+        if one.grade is Grade.SUPPORTED and 0 < late.get(name, 0.0) < shortest
         else one
         for name, one in findings.items()
     }

@@ -202,6 +202,10 @@ class GradeSettings:
     """A rival is tried in the place of an effect if it left no more than this times what the effect left when
     it was added."""
 
+    includer_better: float = 0.15
+    """One that includes an effect is tried in its place if it left less than the effect by this: for a
+    low-pass at the floor a second order left at most 0.04 less in 16 of 17 cases, for two poles 0.2 less."""
+
     rivals: int = 3
     """Rivals tried at most for each effect."""
 

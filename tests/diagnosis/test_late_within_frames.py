@@ -50,3 +50,10 @@ def test_delays_within_a_frame_are_doubted_beside_a_coarse_clock():
 
 def test_what_makes_nothing_late_is_not_doubted():
     assert graded(2e-3, leak=EFFECTS["leak"](rate=1.0), **SCAN) is Grade.SUPPORTED
+
+
+def test_delays_within_a_tick_are_doubted_whatever_the_frames():
+    """A clip of v2e at 333 Hz with stamps of 1 ms had a latency of 0.47 ms that was not there."""
+    clock = {"timestamp": EFFECTS["timestamp"](jitter=0.0, step=5e-4)}
+    for delay, grade in ((4.7e-4, Grade.EITHER), (8e-4, Grade.SUPPORTED)):
+        assert graded(3e-3, latency=EFFECTS["latency"](delay=delay), **clock) is grade

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from dase.diagnosis import effect_search
-from dase.diagnosis.effect_search import _go_the_other_way, _is_enough
+from dase.diagnosis.effect_search import _go_the_other_way
 from dase.diagnosis.state import DiagnosisState, DiagnosisTask, SearchPath
 from dase.effects import EFFECTS
 from dase.fitting.model import FittedModel, model_of
@@ -106,23 +106,6 @@ def test_a_long_way_begins_no_other(monkeypatch, state):
     begun, (model, _) = searched(monkeypatch, state, 1.1)
     assert not begun
     assert state.task.added_to(model) == ("linlog",)
-
-
-@pytest.mark.parametrize(("end", "taken"), [(0.3, True), (0.7, False)])
-def test_a_way_at_the_floor_is_left_for_one_that_leaves_chance_alone(monkeypatch, state, end, taken):
-    monkeypatch.setattr(
-        effect_search, "_add_one_by_one", lambda *given: (model_with("dark", "leak"), judged(end))
-    )
-    model, _ = _go_the_other_way(state, None, model_with("linlog"), judged(1.1), 4)
-    assert state.task.added_to(model) == (("dark", "leak") if taken else ("linlog",))
-
-
-@pytest.mark.parametrize(("error", "doubt", "enough"), [
-    (0.4, None, True), (1.1, None, False), (1.1, 0.5, True), (2.0, 0.5, False),
-])  # fmt: skip
-def test_what_guessed_light_leaves_begins_no_other_way(state, error, doubt, enough):
-    state.task.evidence.held = SimpleNamespace(doubt=doubt)
-    assert _is_enough(state.task, judged(error)) == enough
 
 
 def test_what_the_first_way_found_begins_no_other(monkeypatch, state):
