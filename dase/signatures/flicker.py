@@ -233,7 +233,7 @@ def _refine_tone(
             if len(part) < s.fewest_blocks:
                 continue
             turn = np.angle(part * np.conj(part.sum())) / (2 * np.pi)
-            near = (np.abs(turn) < 0.25) & (count[i : i + size] > 0)
+            near = (np.abs(turn) < 0.25) & (count[i : i + size] > 0) & (np.abs(part) > 0)
             if near.sum() < 4:
                 continue
             # a phase of n independent events whose sum is z is uncertain by sqrt(n / 2) / |z|: at the end of
