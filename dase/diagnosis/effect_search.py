@@ -105,8 +105,9 @@ def _known_at_frames(
     state: DiagnosisState, compared: ComparedMeasurement, model: FittedModel, judgement: Judgement
 ) -> Measurement | None:
     """Return the measurement with its clip known at its frames alone, if that explains more of it."""
-    if leaves_nothing(judgement):
+    if leaves_nothing(judgement) or model is state.asked_at_frames:
         return None
+    state.asked_at_frames = model
     evidence, seed = state.task.evidence, state.task.seed
     return known_at_frames_alone(
         compared.measurement, evidence, model, judgement.error, compared.split, seed=seed

@@ -131,6 +131,7 @@ class DiagnosisState:
         after_step: Told the model and the errors so far after each step.
         other_scene: The measurement with its clip known at its frames alone, or behind a lens, which explains
             it better: what was searched before says nothing then.
+        asked_at_frames: The model of which it was asked last whether its clip is known at its frames alone.
         evaluations_before: Simulations that were run before the measurement was split anew.
         samples_before: Pixels times samples of those.
         doubles: Whether double events are seen, and tried.
@@ -142,6 +143,7 @@ class DiagnosisState:
     notes: list[str] = field(default_factory=list)
     after_step: Callable[[FittedModel, list[float]], None] = lambda model, errors: None
     other_scene: Measurement | None = None
+    asked_at_frames: FittedModel | None = None
     evaluations_before: int = 0
     samples_before: int = 0
     doubles: bool = False
