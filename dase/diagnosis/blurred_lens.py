@@ -23,7 +23,14 @@ from dase.diagnosis.state import DiagnosisTask
 from dase.effects.optics_blur import OpticsBlur
 from dase.fitting.data_split import SplitMeasurement
 from dase.fitting.measurement import Measurement, with_lens
-from dase.fitting.model import FittedModel, fit_present_model, fit_roughly, model_of, refit_model
+from dase.fitting.model import (
+    FittedModel,
+    fit_present_model,
+    fit_roughly,
+    model_of,
+    refit_model,
+    still_free,
+)
 from dase.formatting import format_percent
 from dase.probes.random_streams import SimulationStream
 from dase.results import Diagnosis, Estimate, Finding, Grade
@@ -278,7 +285,7 @@ def seen_through_a_lens(
     bare = model.sensor
     for effect in model.sensor.effects:
         bare = bare if effect.name in known else bare.without(effect.name)
-    tried = [(bare, [axis.name for axis in model.space.axes if axis.effect.name in bare])]
+    tried = [(bare, still_free(bare, model))]
     tried += [(one.sensor, [axis.name for axis in one.space.axes]) for one in first[: settings.others]]
 
     @lru_cache(len(settings.widths))  # of those that each is tried behind
