@@ -44,6 +44,10 @@ class ReadingSettings:
     latency: float = 150e-6
     """[s] At least."""
 
+    middle: float = 0.01
+    """Share of the time from frame to frame within which events come at its middle: a simulator that spreads
+    those of a frame evenly sends a single one there, and nothing is late."""
+
     jitter: float = 25e-6
     """[s] At least."""
 
@@ -190,12 +194,14 @@ def _effects_of(
         return out  # by what groups of pixels differ is not known
     lines = np.array([one.line() for one in groups])
     errors = NINETY * lines.std(axis=0, ddof=1) / math.sqrt(len(groups))
-    if late >= settings.latency:
+    early = _early_half(delays)
+    near = settings.middle * delays.gap
+    in_the_middle = abs(late - 0.5 * delays.gap) <= near and early[0] <= near
+    if late >= settings.latency and not in_the_middle:
         half = math.hypot(float(errors[0]), settings.known * late)
         sentence = f"events come {format_seconds(late)} after the frame that makes them, in bright light, too"
         mine = {"latency.delay": Estimate(late, late - half, late + half)}
         out.append((Latency(delay=late, light=0.0), sentence, mine))
-    early = _early_half(delays)
     if early[0] >= settings.jitter and early.max() <= settings.even * early.min():
         jitter = float(early.mean())
         apart = np.array([_early_half(one).mean() for one in groups])

@@ -9,7 +9,9 @@ from helpers.frame_simulator import HEIGHT, WIDTH, shaken_texture
 from helpers.held_pixels import held_with_low_pass
 
 import dase
+from dase.diagnosis.direct_readings import READINGS, _effects_of
 from dase.effects import EFFECTS
+from dase.fitting.delays_after_frames import DelaysAfterFrames
 from dase.results import Diagnosis, Grade
 from dase.scenes.video import VideoScene
 
@@ -96,3 +98,16 @@ def test_latency_of_more_than_a_frame_is_left_to_the_search(scene):
         one for one in found.findings
         if one.effect == "latency" and one.parameters["latency.delay"].value < gap
     ]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("late", "apart", "names"),
+    [(1e-3, 5e-6, []), (0.7e-3, 5e-6, ["latency"]), (1e-3, 8e-5, ["latency", "timestamp"])],
+)
+def test_single_events_in_the_middle_of_their_frames_are_not_late(late, apart, names):
+    rng, count = np.random.default_rng(0), 8000
+    delays = DelaysAfterFrames(
+        way=rng.uniform(0.02, 1.0, count), late=late + apart * rng.standard_normal(count),
+        level=np.zeros(count), gap=2e-3, group=np.arange(count) % 8, square=rng.uniform(0, 1, count),
+    )  # fmt: skip
+    assert [effect.name for effect, _, _ in _effects_of(delays, READINGS)] == names
