@@ -33,6 +33,7 @@ LONGEST = (
     *("test_cuda_compiles", "test_descent", "test_detection_limits", "test_endings"),
     *("test_effects_voltage", "test_user_readout_alike", "test_honest_findings", "test_frame_alignment"),
     *("test_burst_strength", "test_sensor_edit", "test_learned_sensor", "test_unequal_thresholds"),
+    *("test_uneven_light", "test_code_metrics", "test_recording"),
 )
 """Files that take longest, in this order: where processes share the work, these are begun first."""
 

@@ -40,7 +40,7 @@ LINE = 4e-6
 """Time from row to row of a scan [s]."""
 
 
-@pytest.mark.parametrize("loss", [0.65, 0.0])
+@pytest.mark.parametrize("loss", [0.65, pytest.param(0.0, marks=pytest.mark.slow)])
 def test_it_is_found_beside_what_stood_in_for_it(loss):
     """Events of another simulator with a dark current, behind a scan: a search follows a single start."""
     scene = shaken_texture()

@@ -113,6 +113,7 @@ def test_links_in_circles_end(tmp_path):
     assert counted.calls < 50_000
 
 
+@pytest.mark.slow
 def test_many_names_of_one_image_count_as_many(tmp_path, rng):
     path = tmp_path / "a.h5"
     reference_io.SAMPLES["HDF5"][1](path, reference_io.events(rng, 300, 48, 36))

@@ -249,6 +249,7 @@ def test_a_recording_never_unpickles(tmp_path):
     assert not (tmp_path / "unpickled").exists()
 
 
+@pytest.mark.slow
 def test_every_shared_recording_opens(shared):
     paths = sorted(p for p in (shared / "recordings").rglob("*.*") if p.stem != "noise_iebcs")
     assert len(paths) >= 14

@@ -175,6 +175,7 @@ def test_camera_shake_frames_lie_on_its_events(shared):
     assert found.score > 0.85
 
 
+@pytest.mark.slow
 def test_between_frames_the_cradle_moves_as_its_events_say(shared):
     """Windows of 10 ms: the scene's changes agree better with the events than straight interpolation's."""
     events, frames, begin, end = recording(shared, "davis346_cuke_cradle")

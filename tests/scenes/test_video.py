@@ -279,7 +279,7 @@ def test_good_videos_of_every_codec_open(tmp_path, suffix, code):
     ("suffix", "code", "size"),
     [
         ("webm", "VP80", (3840, 2160)),
-        ("avi", "MJPG", (3840, 2160)),
+        pytest.param("avi", "MJPG", (3840, 2160), marks=pytest.mark.slow),
         pytest.param("webm", "VP90", (2560, 2556), marks=pytest.mark.slow),
     ],
 )
