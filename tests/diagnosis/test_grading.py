@@ -416,3 +416,14 @@ def test_what_includes_an_effect_is_its_rival_where_something_unknown_may_look_l
         assert [
             one.name for one in _rivals_to_try(task, path, model, "bandwidth", doubtful=doubtful)
         ] == names
+
+
+@pytest.mark.parametrize(("left", "names"), [(0.40, ["second_order"]), (0.55, [])])
+def test_what_includes_an_effect_and_left_clearly_less_is_its_rival(left, names):
+    """Two poles of ESIM left 0.41, the low-pass that was announced for them 0.64."""
+    other = SimpleNamespace(name="second_order", error=left, judgement=judged(left), model=None)
+    task = SimpleNamespace(settings=DEFAULTS, effects=EFFECTS)
+    path = SearchPath(alternatives={"bandwidth": [other]}, error_of={"bandwidth": 0.64})
+    model = model_of(Sensor().with_effect(EFFECTS["bandwidth"]()))
+    found = _rivals_to_try(task, path, model, "bandwidth", doubtful=False)
+    assert [one.name for one in found] == names
