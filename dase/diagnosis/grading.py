@@ -319,9 +319,9 @@ def _rivals_to_try(
     settings, out = task.settings.grades, list[Candidate]()
     for other in path.alternatives.get(name, []):
         includes = name in task.effects[other.name].includes if other.name in task.effects else False
-        clearly = other.error < path.error_of.get(name, 0.0) - settings.includer_better
-        includes = includes and not doubtful and not clearly
-        if other.name in model.space.sensor or includes or other.judgement is None:
+        far_better = other.error < path.error_of.get(name, 0.0) - settings.includer_better
+        simpler_is_said = includes and not doubtful and not far_better
+        if other.name in model.space.sensor or simpler_is_said or other.judgement is None:
             continue
         level = max(other.judgement.level, settings.usual)
         near = settings.rival * max(path.error_of.get(name, 0.0) - level, 0.0) + settings.tie

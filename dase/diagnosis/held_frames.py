@@ -58,7 +58,7 @@ class HeldFrameSettings:
     """Share of the error of a last model with a low-pass that one from frame to frame leaves, at most."""
 
     roughly: float = 1.5
-    """What such a low-pass may leave after a fit to few pixels, in units of that, for a full one."""
+    """Times that share that such a low-pass may leave after a fit to few pixels, for a full fit to follow."""
 
     at_once: float = 0.1
     """Times after a frame, relative to that to the next, at which events are not late."""

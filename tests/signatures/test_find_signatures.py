@@ -660,3 +660,13 @@ def test_circling_dot(shared):
     assert looked["hot pixels"].size == 7
     assert looked["grouping"].answer == "cannot say"  # nothing is left beside the edge of the dot
     assert looked["fixed pattern"].answer == "cannot say"
+
+
+def test_events_of_one_polarity_are_looked_at_as_all_others_are(rng):
+    """Blocks without a phase divided zero by zero, of which tests make an error."""
+    count = 60_000
+    events = Events(
+        t=np.sort(rng.uniform(0, 4, count)), x=rng.integers(0, 64, count).astype(np.uint16),
+        y=rng.integers(0, 48, count).astype(np.uint16), p=np.ones(count, np.int8), width=64, height=48,
+    )  # fmt: skip
+    assert "flicker" not in found(events)
