@@ -15,7 +15,8 @@ processes of the same code differ by some per cent as long as they live. A figur
 is named and left out.
 
 `--hidden FOLDER --case a_01` diagnoses a case of another simulator, `a_01.npz` with `clip_a.npz` beside it,
-as `perf.experiments.blind_diagnosis.run` reads them, instead of a made one.
+as `perf.experiments.blind_diagnosis.run` reads them, instead of a made one. `--sensor FILE`
+gives both the same noisy sensor, where their presets differ.
 """
 
 from __future__ import annotations
@@ -96,7 +97,7 @@ def make_simulate(options: argparse.Namespace) -> Work:
     import dase
 
     size = (346, 260, 256) if options.device != "cpu" else (173, 130, 256)
-    scene, sensor = clip(*size), dase.load_sensor("davis346")
+    scene, sensor = clip(*size), dase.load_sensor(options.sensor)
 
     def call() -> list[Any]:
         events = dase.simulate(scene, sensor, seed=1, device=options.device)
@@ -204,6 +205,7 @@ class Worker:
     def __init__(self, checkout: Path, options: argparse.Namespace):
         one = {name: "1" for name in ("DASE_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")}
         command = [sys.executable, __file__, "--worker", "--device", options.device]
+        command += ["--sensor", options.sensor]
         if options.hidden:
             command += ["--hidden", str(options.hidden.resolve()), "--case", options.case]
         self.process = subprocess.Popen(
@@ -313,6 +315,8 @@ def measure_round(
 
 def commit_of(checkout: Path) -> str:
     """Return the commit of a checkout, marked where files are changed."""
+    if not (checkout / ".git").exists():  # a copy: Git would tell of a repository around it
+        return "unknown"
     command = ["git", "-C", str(checkout), "describe", "--always", "--dirty", "--abbrev=10"]
     said = subprocess.run(command, capture_output=True, text=True, check=False).stdout.strip()
     return said or "unknown"
@@ -342,6 +346,7 @@ def main() -> int:
     parser.add_argument("--rounds", type=int, default=4, help="fresh pairs of processes")
     parser.add_argument("--pairs", type=int, help="pairs of calls in a round  [default: by figure]")
     parser.add_argument("--core", type=int, help="core of both  [default: the last one]")
+    parser.add_argument("--sensor", default="davis346", help="noisy sensor: preset or file")
     parser.add_argument("--hidden", type=Path, help="folder of cases of another simulator")
     parser.add_argument("--case", default="a_01", help="case in it")
     parser.add_argument("-o", "--output", type=Path, help="JSON file to write")
@@ -353,6 +358,8 @@ def main() -> int:
         return 0
     if options.after is None:
         parser.error("name two checkouts")
+    if Path(options.sensor).is_file():  # the checkouts are the working directories
+        options.sensor = str(Path(options.sensor).resolve())
     if options.core is None and hasattr(os, "sched_getaffinity"):
         options.core = max(os.sched_getaffinity(0))
     commits = {"before": commit_of(options.before), "after": commit_of(options.after)}
