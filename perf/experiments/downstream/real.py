@@ -3,11 +3,11 @@
     python -m perf.experiments.downstream.real RECORDING --camera davis240c --photos FOLDER --out OUT
 
 Reconstruction as in `run`: the same size, scenes and seeds, trained on ESIM's default, broad randomisation,
-S2R's threshold tuned to the recording's rate of events, the preset of its camera, and with `--fitted` what
-`dase fit` made of the recording. Each network is judged half way and at the end of its training, as
-`dase evaluate` does, and all on the same frames. The same call goes on where it stopped. `results.jsonl` has
-a line for each network; the table is printed at the end.
-`published` judges a published network beside them.
+S2R's threshold tuned to the recording's rate of events, the preset of its camera, and with `--fitted` and
+`--diagnosed` what `dase fit` and `dase diagnose` made of the recording. Each network is judged half way and
+at the end of its training, as `dase evaluate` does, and all on the same frames. The same call goes on where
+it stopped. `results.jsonl` has a line for each network; the table is printed at the end. `published` judges a
+published network beside them.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ from typing import Any
 import numpy as np
 
 import dase
+from dase.files.atomic_file import replacing
 from perf.experiments.downstream.run import SMALL, Job, Size, Study, run_jobs, unpack_photos
 from perf.experiments.downstream.sensors import (
     Training,
@@ -34,7 +35,7 @@ from perf.experiments.downstream.sensors import (
 )
 from perf.experiments.downstream.table import mean_text, read_rows
 
-KINDS = ("esim", "broad", "tuned", "camera", "fitted")
+KINDS = ("esim", "broad", "tuned", "camera", "fitted", "diagnosed")
 """What is trained on."""
 METRICS = ("mse", "mse_affine", "mse_histogram", "ssim", "ms_ssim")
 """What the table has."""
@@ -48,13 +49,15 @@ class RealStudy(Study):
         recording: File with frames.
         camera: Preset of its camera.
         offset: From the frames' times to the middles of their exposures [s].
-        fitted: Sensor that was fitted to the recording.
+        fitted: File of the sensor that was fitted to the recording.
+        diagnosed: File of the sensor that a diagnosis left of it.
     """
 
     recording: str = ""
     camera: str = ""
     offset: float = 0.0
     fitted: str = ""
+    diagnosed: str = ""
 
     def learned(self) -> set[tuple[str, str]]:
         """Return what has been learned of the recording: a threshold that is tuned, and what was fitted."""
@@ -77,8 +80,8 @@ class RealStudy(Study):
         """Return what is trained on."""
         if kind == "camera":
             return Training(dase.load_sensor(self.camera))
-        if kind == "fitted":
-            return Training(in_midst(dase.load_sensor(self.fitted)))
+        if kind in ("fitted", "diagnosed"):
+            return Training(in_midst(dase.load_sensor(self.fitted if kind == "fitted" else self.diagnosed)))
         if kind == "tuned":
             base = json.loads(self.learned_file("tune", target).read_text("utf-8"))["tuned"]
             return Training(plain_sensor(base), tuned_thresholds(base))
@@ -92,15 +95,20 @@ class RealStudy(Study):
         begin, found = time.monotonic(), {}
         steps = self.size.steps(job.task)
         for name, stop in (("half_way", steps // 2), ("end", steps)):
-            self.train_one(job, stop)
-            file = self.folder(job) / "checkpoint.pt"
-            judged = dase.tasks.evaluate(file, self.recording, offset=self.offset, device=self.device)
-            found[name] = {metric: round(value, 5) for metric, value in judged.metrics.items()}
+            note = self.folder(job) / f"{name}.json"
+            # a call that goes on has a network of later steps
+            if not note.exists():
+                self.train_one(job, stop)
+                file = self.folder(job) / "checkpoint.pt"
+                judged = dase.tasks.evaluate(file, self.recording, offset=self.offset, device=self.device)
+                seen = {metric: round(value, 5) for metric, value in judged.metrics.items()}
+                with replacing(note) as temporary:
+                    temporary.write_text(json.dumps(seen | {"frames": judged.windows}) + "\n", "utf-8")
+            found[name] = json.loads(note.read_text("utf-8"))
+        frames = {one.pop("frames") for one in found.values()}.pop()
         row = {"recording": Path(self.recording).stem, "kind": job.kind, "camera": self.camera}
         seconds = round(time.monotonic() - begin, 1)
-        return [
-            {**row, "seed": job.seed, **found, "frames": judged.windows, "steps": steps, "seconds": seconds}
-        ]
+        return [{**row, "seed": job.seed, **found, "frames": frames, "steps": steps, "seconds": seconds}]
 
 
 def table(rows: list[dict[str, Any]]) -> str:
@@ -130,6 +138,7 @@ def main() -> None:
     ask.add_argument("--minutes", type=float, default=1e6)
     ask.add_argument("--seeds", type=int, default=5)
     ask.add_argument("--fitted", default="", help="sensor file that was fitted to the recording")
+    ask.add_argument("--diagnosed", default="", help="sensor file that a diagnosis left of the recording")
     ask.add_argument("--kinds", default=",".join(KINDS))
     ask.add_argument("--steps", type=int, default=Size.reconstruction_steps, help="batches of a training")
     ask.add_argument("--small", action="store_true", help="Do all parts work?")
@@ -140,7 +149,8 @@ def main() -> None:
     size = SMALL if args.small else Size(reconstruction_steps=args.steps)
     study = RealStudy(
         train, test, args.out, "cpu", size, deadline,
-        recording=str(args.recording), camera=args.camera, offset=args.offset, fitted=args.fitted,
+        recording=str(args.recording), camera=args.camera, offset=args.offset,
+        fitted=args.fitted, diagnosed=args.diagnosed,
     )  # fmt: skip
     log = args.out / "results.jsonl"
     # published networks have rows, and no trainings
@@ -150,7 +160,8 @@ def main() -> None:
         ask.error(f"{log} has trainings of another number of steps than {size.reconstruction_steps}")
     done = {(row["kind"], row["seed"]) for row in rows}
     # the quickest first: what is tuned is waited for
-    kinds = [kind for kind in args.kinds.split(",") if kind != "fitted" or args.fitted]
+    given = {"fitted": args.fitted, "diagnosed": args.diagnosed}
+    kinds = [kind for kind in args.kinds.split(",") if given.get(kind, True)]
     plan = [Job("tune", "", args.camera, 0)] if "tuned" in kinds else []
     plan = [job for job in plan if (job.task, job.target) not in study.learned()]
     each = itertools.product(range(args.seeds), kinds)
