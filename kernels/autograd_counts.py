@@ -19,9 +19,7 @@ from torch.autograd.function import once_differentiable
 from dase.kernels import scene_layers as _scene
 from dase.kernels import threshold_counts as _counts
 from dase.kernels import threshold_surrogates as _surrogates
-from dase.kernels.launch import find_device, run_kernel
-
-find_device("cpu")  # starts Warp; a bare wp.from_torch fails before
+from dase.kernels.launch import lend_tensor, run_kernel
 
 Surrogate = Literal["interval", "events", "expected"]
 SURROGATE: Surrogate = "expected"
@@ -163,7 +161,7 @@ class _Count(torch.autograd.Function):
         target = window if once else tuple(range(len(window)))
         counts = torch.zeros(batch, max(target) + 1, 2, pixels, device=log.device)
         seen = _scene.Frames()
-        seen.values = wp.from_torch(log.view(batch * samples, pixels))
+        seen.values = lend_tensor(log.view(batch * samples, pixels))
         lanes = _counts.widest_block(pixels, wp.device_from_torch(log.device), "log")
         shared, aligned = threshold.shape[1] == 1, _counts.samples_are_aligned("log", seen, pixels)
         kernel = _counts.counting_kernel(lanes, "log", shared=shared, states=False, aligned=aligned)
@@ -215,7 +213,7 @@ def launch_on_tensors(
     """
     shape = outputs[0] if over is None else over
     # detached: Warp would ask a tensor that requires a gradient for its .grad
-    arguments = [wp.from_torch(a.detach()) if isinstance(a, torch.Tensor) else a for a in (*inputs, *outputs)]
+    arguments = [lend_tensor(a.detach()) if isinstance(a, torch.Tensor) else a for a in (*inputs, *outputs)]
     device = wp.device_from_torch(shape.device)
     with follow_torch_stream(shape.device):
         run_kernel(

@@ -12,7 +12,7 @@ from torch.autograd.function import once_differentiable
 
 from dase.kernels import scene_layers as _scene
 from dase.kernels.autograd_counts import check_tensor, indices_on_device, launch_on_tensors
-from dase.kernels.launch import thread_count
+from dase.kernels.launch import lend_tensor, thread_count
 from dase.kernels.scene_layers_gradient import render_gradient
 
 Texture = tuple[torch.Tensor, torch.Tensor | None]
@@ -131,7 +131,7 @@ class _Render(torch.autograd.Function):
         copies = (1, 256) if gradient.is_cuda else (lots, lots)
         by_texels = texels.new_zeros(copies[0], len(texels) * wanted[0], 2)
         by_place = place.new_zeros(copies[1], len(place) * wanted[1], *place.shape[1:])
-        outputs = [wp.from_torch(by_texels, dtype=wp.vec2), wp.from_torch(by_place, dtype=_scene.Affine)]
+        outputs = [lend_tensor(by_texels, dtype=wp.vec2), lend_tensor(by_place, dtype=_scene.Affine)]
         inputs = [_lend_layers(texels, place, ctx.sizes), gradient, ctx.width, stretch]
         launch_on_tensors(render_gradient, inputs, outputs, over=gradient, align=stretch)
         sums = [by.sum(0) if want else None for by, want in zip((by_texels, by_place), wanted, strict=True)]
@@ -143,13 +143,13 @@ def _lend_layers(texels: torch.Tensor, place: torch.Tensor, sizes: tuple[tuple[i
     starts = (0, *accumulate(w * h for w, h in sizes))
     corner = place.new_full((len(sizes), 2), torch.inf)
     layers = _scene.Layers()
-    layers.grey = wp.from_torch(texels.detach()[: starts[1], 0].contiguous())
-    layers.texels = wp.from_torch(texels.detach(), dtype=wp.vec2)
-    layers.start = wp.from_torch(indices_on_device(starts[:-1], place.device))
+    layers.grey = lend_tensor(texels.detach()[: starts[1], 0].contiguous())
+    layers.texels = lend_tensor(texels.detach(), dtype=wp.vec2)
+    layers.start = lend_tensor(indices_on_device(starts[:-1], place.device))
     flat = indices_on_device(tuple(side for size in sizes for side in size), place.device)
-    layers.size = wp.from_torch(flat.view(-1, 2), dtype=wp.vec2i)
-    layers.place = wp.from_torch(place.detach(), dtype=_scene.Affine)
-    layers.box = wp.from_torch(torch.cat([-corner, corner], 1), dtype=wp.vec4)
+    layers.size = lend_tensor(flat.view(-1, 2), dtype=wp.vec2i)
+    layers.place = lend_tensor(place.detach(), dtype=_scene.Affine)
+    layers.box = lend_tensor(torch.cat([-corner, corner], 1), dtype=wp.vec4)
     layers.count = len(sizes)
     return layers
 

@@ -11,6 +11,7 @@ import warp as wp
 from dase.kernels import patch_structure as _patches
 from dase.kernels import scene_batch as _scenery
 from dase.kernels.autograd_counts import launch_on_tensors
+from dase.kernels.launch import lend_tensor
 from dase.kernels.scene_layers import Affine
 
 
@@ -46,8 +47,8 @@ def render_log(
     """
     out = torch.empty(*place.shape[:2], height * width, device=place.device)
     inputs = [
-        grey, wp.from_torch(texels, dtype=wp.vec2), background, start, wp.from_torch(size, dtype=wp.vec2i),
-        wp.from_torch(place, dtype=Affine), wp.from_torch(box, dtype=wp.vec4), width, eps,
+        grey, lend_tensor(texels, dtype=wp.vec2), background, start, lend_tensor(size, dtype=wp.vec2i),
+        lend_tensor(place, dtype=Affine), lend_tensor(box, dtype=wp.vec4), width, eps,
     ]  # fmt: skip
     launch_on_tensors(_scenery.render_log, inputs, [out])
     return out.view(*place.shape[:2], height, width)
@@ -74,7 +75,7 @@ def patch_structure(image: torch.Tensor, *, size: int, stride: int) -> dict[str,
     batch, columns, number = _patch_grid(image, size, stride)
     weight = _gaussian_window(size, image.device)
     rows = image.new_empty(batch, number * size, 3, dtype=torch.float32)
-    lent = wp.from_torch(rows, dtype=wp.vec3)
+    lent = lend_tensor(rows, dtype=wp.vec3)
     out = [image.new_empty(batch, number, dtype=torch.float32) for _ in range(4)]
     inputs = [image.float().contiguous(), weight, stride, columns]
     launch_on_tensors(_patches.structure_rows, inputs, [lent], over=rows[..., 0])

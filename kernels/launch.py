@@ -59,6 +59,20 @@ def find_device(name: str) -> wp.Device:
         raise ValueError(f"device '{name}' does not exist, here there are: {names}") from error
 
 
+def lend_tensor(tensor: Any, dtype: Any = None) -> Any:
+    """Return a Warp array over the memory of a PyTorch tensor, without a copy.
+
+    Warp starts here at the earliest, never when a module is imported: with it starts CUDA, and a process that
+    forks or chooses its GPU afterwards would be too late.
+
+    Args:
+        tensor: Contiguous, of any shape.
+        dtype: Of Warp; its last axes are then those of a vector or matrix.
+    """
+    _start_warp()
+    return wp.from_torch(tensor, dtype=dtype)
+
+
 def _forget_threads() -> None:
     """Leave the parent's pool behind in a forked child, where none of its threads lives."""
     global _pool, _starting

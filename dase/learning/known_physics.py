@@ -12,6 +12,7 @@ from dase.effects.threshold import Threshold
 from dase.errors import InputError
 from dase.kernels import launch
 from dase.kernels.autograd_counts import follow_torch_stream
+from dase.kernels.launch import lend_tensor
 from dase.kernels.pixel_codegen_scenes import StoredScenes
 from dase.networks.threshold_network import ThresholdMaps
 from dase.scenes.scene import LOG_EPS
@@ -113,13 +114,13 @@ class KnownPhysics:
         grids = torch.zeros(1, batch, 2, light.shape[2], device=self.device)
         with follow_torch_stream(self.device):
             seen = StoredScenes()
-            seen.values = wp.from_torch(light, dtype=wp.float32)
-            seen.light = wp.from_torch(self._light, dtype=wp.float32)
+            seen.values = lend_tensor(light, dtype=wp.float32)
+            seen.light = lend_tensor(self._light, dtype=wp.float32)
             self._pixels.reset(
-                wp.from_torch(self._places, dtype=wp.int32), wp.from_torch(parameters, dtype=wp.float32),
-                wp.from_torch(seeds.int(), dtype=wp.int32), wp.from_torch(factors, dtype=wp.float32),
+                lend_tensor(self._places, dtype=wp.int32), lend_tensor(parameters, dtype=wp.float32),
+                lend_tensor(seeds.int(), dtype=wp.int32), lend_tensor(factors, dtype=wp.float32),
             )  # fmt: skip
             self._pixels.advance(
-                "frames", seen, self._clock, self._times, wp.from_torch(frames), wp.from_torch(grids), 1
+                "frames", seen, self._clock, self._times, lend_tensor(frames), lend_tensor(grids), 1
             )
         return grids[0].view(batch, 2, *log.shape[2:])

@@ -22,6 +22,7 @@ from dase.errors import InputError, checked_integer, checked_seed
 from dase.kernels import launch, scene_paths
 from dase.kernels import threshold_counts as counting
 from dase.kernels.autograd_counts import follow_torch_stream
+from dase.kernels.launch import lend_tensor
 from dase.kernels.pixel_codegen_scenes import StoredScenes
 from dase.kernels.scene_layers import Affine
 from dase.kernels.scene_windows import LayerScenes, flow_kernel, rendering_kernel
@@ -352,7 +353,7 @@ class BatchMaker:
 
     def _send(self, values: NDArray[Any], dtype: Any) -> wp.array:
         """Return numbers as a Warp array on the device, in memory of PyTorch; nobody waits for the copy."""
-        return wp.from_torch(self._upload(values), dtype=dtype)
+        return lend_tensor(self._upload(values), dtype=dtype)
 
     def _memory(self, name: str, shape: tuple[int, ...], dtype: Any) -> wp.array:
         """Return memory of a shape that is used again by the next one that wants as much, or less, of it."""
@@ -421,7 +422,7 @@ class BatchMaker:
         clock = self._clocks[self._part, first]
         velocity = self._place(clock.t64, clock.run)
         self._scenes.light = self._light(times)
-        lent, bins = (wp.from_torch(frames), wp.from_torch(grids)), getattr(self.stream.represent, "bins", 1)
+        lent, bins = (lend_tensor(frames), lend_tensor(grids)), getattr(self.stream.represent, "bins", 1)
         if self._mixing:
             sharp = self._render(clock.run, len(times), self._whole_view())
             self.pixels.advance("frames", self._through_optics(sharp, times), clock, times, *lent, bins)
@@ -436,7 +437,7 @@ class BatchMaker:
             self.pixels.advance("layers", self._scenes, clock, times, *lent, bins)
         lanes = counting.widest_block(count, self.where, "layers")
         inputs = [
-            self._scenes, velocity, clock.run, self.pixels.places, self.plan.view[0], wp.from_torch(flow)
+            self._scenes, velocity, clock.run, self.pixels.places, self.plan.view[0], lend_tensor(flow)
         ]  # fmt: skip
         blocks = (last - first) * counting.block_count(count, lanes)
         launch.run_kernel(flow_kernel(lanes), blocks, inputs, self.where, batch=self.plan.batch)
@@ -522,7 +523,7 @@ class BatchMaker:
                 seen = (StaticScene(*self.plan.view, 1.0, frame) for frame in frames.cpu().numpy())
                 found = [effect.bound_to(one).map_values(at) for one, at in zip(seen, places, strict=True)]
                 rows.append(torch.from_numpy(np.stack(found)).to(self.device))
-        return wp.from_torch(torch.cat(rows, 1).float().contiguous())
+        return lend_tensor(torch.cat(rows, 1).float().contiguous())
 
     def _middle_frames(self) -> torch.Tensor:
         """Return what the whole cameras see at the middle samples of their scenes, shape (B, H, W)."""

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import ast
 import re
+import subprocess
+import sys
 from functools import cache
 
 import pytest
@@ -143,3 +145,24 @@ def test_kernels_know_nothing_of_dase():
     for module, found in GRAPH.items():
         if module.startswith("dase.kernels"):
             assert all(one.module.startswith("dase.kernels") for one in found), module
+
+
+def test_no_import_starts_warp():
+    """With Warp starts CUDA: a process that forks or chooses its GPU after an import would be too late."""
+    pytest.importorskip("torch")
+    said = subprocess.run(
+        [sys.executable, "-c", STARTS_WARP], cwd=ROOT, capture_output=True, text=True, check=True
+    )
+    assert said.stdout.split() == []
+
+
+STARTS_WARP = """
+import importlib, pkgutil, dase
+import warp._src.context as context
+for found in pkgutil.walk_packages(dase.__path__, "dase."):
+    if not found.name.endswith("__main__"):
+        importlib.import_module(found.name)
+        if context.runtime is not None:
+            print(found.name)
+            break
+"""
