@@ -11,6 +11,8 @@ import torch
 from dase.errors import InputError
 from dase.files.atomic_file import replacing
 from dase.files.text_files import stands_for
+from dase.learning import distributed
+from dase.tasks.carried_memory import CarriedMemory
 from dase.tasks.event_networks import NETWORKS, EventNetwork
 
 KIND = "dase.tasks 1"
@@ -26,6 +28,7 @@ def save_checkpoint(
     step: int,
     steps: int,
     window: float,
+    memory: CarriedMemory | None = None,
 ) -> None:
     """Write a training so that it can go on as if it had not stopped; the file appears whole or not at all.
 
@@ -37,11 +40,12 @@ def save_checkpoint(
         step: Steps done.
         steps: Steps that the learning rate was laid out for.
         window: Duration of the windows [s].
+        memory: What the network remembers behind the last batch; None for a network without.
     """
     content = {
         "kind": KIND, "network": network.kind, "shape": network.shape, "weights": network.state_dict(),
         "averaged": averaged.state_dict(), "optimizer": optimizer.state_dict(), "step": step, "steps": steps,
-        "window": window,
+        "window": window, "memory": {} if memory is None else memory.tensors,
     }  # fmt: skip
     with replacing(path) as temporary:
         torch.save(content, temporary)
@@ -74,6 +78,7 @@ def restore_training(
     steps: int,
     window: float,
     device: str | torch.device,
+    memory: CarriedMemory | None = None,
 ) -> int:
     """Put a training where `path` says that it stopped, and return the steps done; 0 where there is no file.
 
@@ -89,6 +94,9 @@ def restore_training(
     network.load_state_dict(found["weights"])
     averaged.load_state_dict(found["averaged"])
     optimizer.load_state_dict(found["optimizer"])
+    # of several processes, the file has the scenes of the first; files of before have no memory
+    if memory is not None and distributed.process_count() == 1:
+        memory.tensors = found.get("memory", {})
     step: int = found["step"]
     return step
 

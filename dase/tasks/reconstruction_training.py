@@ -13,6 +13,7 @@ import torch
 
 from dase.errors import InputError
 from dase.learning import distributed
+from dase.tasks.carried_memory import CarriedMemory
 from dase.tasks.checkpoints import restore_training, save_checkpoint
 from dase.tasks.event_networks import EventNetwork
 from dase.tasks.image_metrics import Lpips, structural_similarity, temporal_inconsistency
@@ -31,7 +32,7 @@ class ReconstructionTraining(Optimisation):
         temporal: Weight of the temporal inconsistency (S2R, 2020).
         lpips: Weight of the perceptual distance, where a file of its weights is named.
         lpips_weights: That file, see `Lpips`; None for no perceptual distance.
-        skip: First windows of a sequence that only the temporal loss counts: nothing is known there yet.
+        skip: First windows of a scene that only the temporal loss counts: nothing is known there yet.
     """
 
     l1: float = 1.0
@@ -56,7 +57,8 @@ def train_reconstruction(
     Args:
         network: With any weights; they are drawn anew from the seed.
         batches: Returns batches from a number on, as `lambda first: dase.torch.Stream(first_batch=first)`.
-            Each batch is a whole sequence: what is remembered begins anew with it.
+            What the network remembers goes on from batch to batch until `Batch.reset`, so scenes may go on
+            for several, as with `Stream(scene_batches=4)`; gradients end with the batch.
         folder: Gets `checkpoint.pt` and `log.jsonl`, a JSON object per line.
         settings: How it is trained.
 
@@ -77,15 +79,19 @@ def train_reconstruction(
     averaged = copy.deepcopy(network)
     perceptual = None if settings.lpips_weights is None else Lpips(settings.lpips_weights).to(device)
 
+    memory = CarriedMemory()
+
     def forward(batch: Batch) -> torch.Tensor:
-        return network.sequence(batch.inputs, batch.reset)[0]
+        return memory.sequence(network, batch)
 
     def losses(made: torch.Tensor, batch: Batch) -> Losses:
         return reconstruction_losses(made, batch, settings, perceptual)
 
     take_step = TrainingStep(network, averaged, settings, device, forward, losses)
     optimizer, steps, window = take_step.optimizer, settings.steps, settings.window
-    first = restore_training(path, network, averaged, optimizer, steps=steps, window=window, device=device)
+    first = restore_training(
+        path, network, averaged, optimizer, steps=steps, window=window, device=device, memory=memory
+    )
     if first < settings.last_step:
         source = iter(batches(first))
         for step in range(first, settings.last_step):
@@ -103,7 +109,9 @@ def train_reconstruction(
                     with (folder / "log.jsonl").open("a", encoding="utf-8") as log:
                         log.write(json.dumps({"step": done, **row}) + "\n")
             if (done % settings.save_every == 0 or last) and distributed.process_rank() == 0:
-                save_checkpoint(path, network, averaged, optimizer, step=done, steps=steps, window=window)
+                save_checkpoint(
+                    path, network, averaged, optimizer, step=done, steps=steps, window=window, memory=memory
+                )
     distributed.leave_processes()
     averaged.eval()
     return averaged
@@ -120,9 +128,13 @@ def reconstruction_losses(
         settings: Weights of the parts.
         perceptual: LPIPS, where its weights are known.
     """
-    skip = min(settings.skip, len(made) - 1)
-    seen, real = made[skip:].flatten(0, 1), batch.frames[skip:].flatten(0, 1)
-    losses = {"l1": (seen - real).abs().mean(), "ssim": (1 - structural_similarity(seen, real)).mean()}
+    seen, real = made.flatten(0, 1), batch.frames.flatten(0, 1)
+    counted = _windows_that_count(batch.reset, settings.skip).flatten().float()
+    weight = counted / counted.sum()
+    losses = {
+        "l1": (weight * (seen - real).abs().mean((1, 2, 3))).sum(),
+        "ssim": (weight * (1 - structural_similarity(seen, real))).sum(),
+    }
     losses["loss"] = settings.l1 * losses["l1"] + settings.ssim * losses["ssim"]
     if settings.temporal and len(made) > 1:
         parts = made[1:], made[:-1], batch.frames[1:], batch.frames[:-1]
@@ -135,6 +147,16 @@ def reconstruction_losses(
         )
         losses["loss"] = losses["loss"] + settings.temporal * losses["temporal"]
     if perceptual is not None:
-        losses["lpips"] = perceptual(seen, real).mean()
+        losses["lpips"] = (weight * perceptual(seen, real)).sum()
         losses["loss"] = losses["loss"] + settings.lpips * losses["lpips"]
     return losses
+
+
+def _windows_that_count(reset: torch.Tensor, skip: int) -> torch.Tensor:
+    """Return which windows are at least `skip` behind the begin of their scene, bool, shape (T, B)."""
+    fresh = torch.zeros_like(reset)
+    for after in range(min(skip, len(reset))):
+        fresh[after:] |= reset[: len(reset) - after]
+    counted = ~fresh
+    counted[-1] = True  # a batch of begins alone would teach nothing
+    return counted

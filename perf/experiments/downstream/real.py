@@ -141,12 +141,13 @@ def main() -> None:
     ask.add_argument("--diagnosed", default="", help="sensor file that a diagnosis left of the recording")
     ask.add_argument("--kinds", default=",".join(KINDS))
     ask.add_argument("--steps", type=int, default=Size.reconstruction_steps, help="batches of a training")
+    ask.add_argument("--scene-batches", type=int, default=4, help="batches that a scene goes on for")
     ask.add_argument("--small", action="store_true", help="Do all parts work?")
     args = ask.parse_args()
     deadline = time.monotonic() + 60 * args.minutes
     args.out.mkdir(parents=True, exist_ok=True)
     train, test = unpack_photos(args.photos, args.out)
-    size = SMALL if args.small else Size(reconstruction_steps=args.steps)
+    size = SMALL if args.small else Size(reconstruction_steps=args.steps, scene_batches=args.scene_batches)
     study = RealStudy(
         train, test, args.out, "cpu", size, deadline,
         recording=str(args.recording), camera=args.camera, offset=args.offset,

@@ -32,6 +32,7 @@ import time
 import traceback
 from collections.abc import Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -83,7 +84,8 @@ class Size:
 
     Args:
         crop: Columns and rows of training and tests [px].
-        windows: Of a sequence for reconstruction.
+        windows: Of a batch for reconstruction.
+        scene_batches: Of reconstruction that a scene goes on for.
         batch: Sequences of a batch for reconstruction.
         flow_batch: Sequences, of `flow_windows` each, of a batch for flow.
         flow_windows: See `flow_batch`.
@@ -103,6 +105,7 @@ class Size:
 
     crop: tuple[int, int] = (112, 112)
     windows: int = 16
+    scene_batches: int = 1
     batch: int = 6
     flow_batch: int = 16
     flow_windows: int = 3
@@ -173,7 +176,7 @@ class Study:
             steps=size.flow_windows if flow else size.windows, window=1 / 30 if flow else 1 / 60,
             samples=2 * size.samples if flow else size.samples, randomise=how.randomise, augment=how.augment,
             device=self.device, seed=seed, regimes=FAST, backgrounds=size.backgrounds, objects=size.objects,
-            first_batch=first,
+            first_batch=first, scene_batches=1 if flow else size.scene_batches,
         )  # fmt: skip
 
     def check_time(self) -> None:
@@ -420,13 +423,22 @@ _study: Study | None = None
 def begin_process(study: Study, device: str) -> None:
     """Prepare a process that does jobs on one device."""
     global _study
-    kind, _, number = device.partition(":")
-    if number:
-        # before CUDA is asked for: nothing then depends on which device is the current one
-        os.environ["CUDA_VISIBLE_DEVICES"] = number
     torch.set_num_threads(1)
     _study = study
-    study.device = kind
+    study.device = device.partition(":")[0]
+
+
+@contextmanager
+def alone_visible(device: str) -> Iterator[None]:
+    """Let processes that start meanwhile see one GPU alone, before anything in them can ask for CUDA."""
+    before, number = os.environ.get("CUDA_VISIBLE_DEVICES"), device.partition(":")[2]
+    if number:
+        os.environ["CUDA_VISIBLE_DEVICES"] = number
+    yield
+    if number and before is None:
+        del os.environ["CUDA_VISIBLE_DEVICES"]
+    elif before is not None:
+        os.environ["CUDA_VISIBLE_DEVICES"] = before
 
 
 def do_job(job: Job) -> list[dict[str, Any]] | None:
@@ -458,7 +470,9 @@ def run_jobs(study: Study, plan: Sequence[Job], devices: Sequence[str], jobs: in
                 break
             if sum(where == device for _, where, _ in running.values()) < jobs:
                 waiting.remove(job)
-                running[pools[device].submit(do_job, job)] = job, device, time.monotonic()
+                with alone_visible(device):
+                    future = pools[device].submit(do_job, job)
+                running[future] = job, device, time.monotonic()
         if not running:
             break
         for one in wait(running, return_when=FIRST_COMPLETED).done:
