@@ -14,11 +14,16 @@ from helpers.scripts import load_script
 from helpers.two_processes import run_as_two_processes
 
 from dase.errors import InputError
+from dase.tasks.carried_memory import CarriedMemory
 from dase.tasks.checkpoints import load_network, read_checkpoint
 from dase.tasks.event_networks import E2VidNet, EvFlowNet, FireNet
 from dase.tasks.flow_training import FlowTraining, flow_loss, train_flow
 from dase.tasks.optimisation import Optimisation
-from dase.tasks.reconstruction_training import ReconstructionTraining, train_reconstruction
+from dase.tasks.reconstruction_training import (
+    ReconstructionTraining,
+    reconstruction_losses,
+    train_reconstruction,
+)
 from dase.tasks.training_step import TrainingStep
 from dase.torch.batch import Batch
 
@@ -27,12 +32,15 @@ FLOW = FlowTraining(steps=6, warm_up=2, average=0.5, save_every=2, log_every=1)
 
 
 def made_batch(number: int) -> Batch:
-    """Return a batch that its number decides: events where frames are bright, flow everywhere alike."""
+    """Return a batch that its number decides: events where frames are bright, flow everywhere alike.
+
+    Scenes go on for three batches.
+    """
     generator = torch.Generator().manual_seed(number % 2)
     frames = torch.rand(3, 2, 1, 16, 16, generator=generator)
     flow = torch.full((3, 2, 2, 16, 16), 60.0)
     reset = torch.zeros(3, 2, dtype=torch.bool)
-    reset[0] = True
+    reset[0] = number % 3 == 0
     return Batch(frames.expand(3, 2, 5, 16, 16), frames, flow, reset, torch.ones(2, 2))
 
 
@@ -76,6 +84,35 @@ def test_stopped_and_resumed_gives_the_same_weights(train, network, settings, tm
     assert not torch.equal(weights(other), weights(whole))
     with pytest.raises(InputError, match="holds another training"):
         train(network, batches, tmp_path / "parts", replace(settings, steps=9))
+
+
+@pytest.mark.parametrize("network", [FireNet(5, 4), E2VidNet(5, 4)], ids=["firenet", "e2vid"])
+def test_a_scene_of_two_batches_is_the_scene_as_one(network):
+    batch = made_batch(0)
+    memory = CarriedMemory()
+    one, other = (memory.sequence(network, replace(batch, reset=made_batch(n).reset)) for n in (0, 1))
+    whole, _ = network.sequence(batch.inputs.repeat(2, 1, 1, 1, 1))
+    torch.testing.assert_close(torch.cat([one, other]), whole)
+    assert not torch.allclose(other, one)
+    # a scene that begins knows nothing, and the other slot goes on
+    reset = made_batch(1).reset
+    reset[0, 1] = True
+    third = memory.sequence(network, replace(batch, reset=reset))
+    torch.testing.assert_close(third[:, 1], one[:, 1])
+    assert not torch.allclose(third[:, 0], one[:, 0])
+    assert not any(kept.requires_grad for kept in memory.tensors[tuple(batch.inputs.shape[1:])])
+
+
+def test_windows_count_from_two_behind_the_begin_of_their_scene():
+    batch = replace(made_batch(1), frames=torch.zeros(3, 2, 1, 16, 16))
+    batch.reset[1, 0] = True  # slot 0 counts window 0 alone, beside the last; slot 1 goes on
+    made = torch.zeros(3, 2, 1, 16, 16)
+    made[0, 0], made[1, 0], made[2, 0] = 1.0, 2.0, 4.0
+    made[0, 1], made[1, 1], made[2, 1] = 8.0, 16.0, 32.0
+    found = reconstruction_losses(made, batch, ReconstructionTraining(skip=2), None)
+    assert float(found["l1"]) == pytest.approx((1 + 4 + 8 + 16 + 32) / 5)
+    found = reconstruction_losses(made, batch, ReconstructionTraining(skip=0), None)
+    assert float(found["l1"]) == pytest.approx((1 + 2 + 4 + 8 + 16 + 32) / 6)
 
 
 @pytest.mark.parametrize(

@@ -108,7 +108,8 @@ class RealStudy(Study):
         frames = {one.pop("frames") for one in found.values()}.pop()
         row = {"recording": Path(self.recording).stem, "kind": job.kind, "camera": self.camera}
         seconds = round(time.monotonic() - begin, 1)
-        return [{**row, "seed": job.seed, **found, "frames": frames, "steps": steps, "seconds": seconds}]
+        how = {"steps": steps, "scene_batches": self.size.scene_batches, "seconds": seconds}
+        return [{**row, "seed": job.seed, **found, "frames": frames, **how}]
 
 
 def table(rows: list[dict[str, Any]]) -> str:
