@@ -106,12 +106,31 @@ def simulate_pixels(
     # a GPU takes all models in one launch, if they have one clock and one seed
     if kind == "cuda" and np.all(seeds == seeds[0]) and np.all(finer == finer[0]):
         return out(slice(0, len(seeds)))
-    # on a CPU one after the other: the events of a model are sorted in its caches, those of all are not
-    works = [partial(out, slice(n, n + 1)) for n in range(len(seeds))]
-    return [
-        events
-        for (events,) in ([work() for work in works] if kind == "cuda" else launch.run_concurrently(works))
-    ]
+    if kind == "cuda":
+        return [events for n in range(len(seeds)) for events in out(slice(n, n + 1))]
+    works = [partial(out, rows) for rows in _rows_at_a_time(stimulus, seeds, finer)]
+    return [events for some in launch.run_concurrently(works) for events in some]
+
+
+def _rows_at_a_time(stimulus: Stimulus, seeds: NDArray[np.int64], finer: NDArray[np.int64]) -> list[slice]:
+    """Return the models of each run on a CPU, which are B by their seeds and samples per step, shape (B,).
+
+    Those of one seed and as many samples share what it takes to begin a run, which is as long as simulating a
+    small one. All threads get as many, after the first, which `run_concurrently` does before the others.
+    """
+    samples = len(stimulus.pixels) * stimulus.grid.steps * finer
+    most = max(1, -(-(len(seeds) - 1) // launch.thread_count()))
+    out, first = [slice(0, 1)], 1
+    for n in range(2, len(seeds) + 1):
+        alike = n < len(seeds) and seeds[n] == seeds[first] and finer[n] == finer[first]
+        if not alike or n - first == most or (n - first + 1) * samples[first] > SAMPLES_OF_A_RUN:
+            out.append(slice(first, n))
+            first = n
+    return out
+
+
+SAMPLES_OF_A_RUN = 1 << 22
+"""Samples of pixels of models that are simulated together: events of more are not sorted in the caches."""
 
 
 def pass_readout(

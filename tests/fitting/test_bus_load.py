@@ -14,6 +14,7 @@ from dase.effects.mismatch import Mismatch
 from dase.effects.readout import Readout
 from dase.effects.row_scan import RowScan
 from dase.effects.stream import Others
+from dase.fitting import readout_simulator
 from dase.fitting.batch_simulator import SimulationOrder
 from dase.fitting.bus_use import BusUse, least_bus_rate
 from dase.fitting.data_split import SPLIT, split_measurement
@@ -84,6 +85,23 @@ def test_others_take_as_much_time_as_what_they_stand_for(rng, weight):
     before = sum(w * np.count_nonzero(rest.p == p) for p, w in enumerate(weight))
     begin = rest.t[0] if before else last.t[0]  # the bus does not rest from the first to the last
     assert end - begin == pytest.approx((before + 1) / bus.rate, rel=0.03)
+
+
+@pytest.mark.parametrize("room", [1, 1 << 22])
+def test_models_that_are_simulated_together_are_those_alone(evidence, true, monkeypatch, room):
+    monkeypatch.setattr(readout_simulator, "SAMPLES_OF_A_RUN", room)
+    stimulus = evidence.train.trials.stimulus
+    vectors = np.repeat(true.parameters()[None], 9, 0)
+    vectors[:, true.parameter_names().index("threshold.on")] = np.linspace(0.15, 0.4, 9)
+    seeds, finer = np.array([3, 3, 3, 4, 4, 4, 4, 3, 3]), np.array([1, 1, 1, 1, 2, 2, 2, 2, 1])
+    together = simulate_pixels(stimulus, true, vectors, seeds, finer)
+    assert len(together) == 9
+    for n, events in enumerate(together):
+        one = slice(n, n + 1)
+        (alone,) = simulate_pixels(stimulus, true, vectors[one], seeds[one], finer[one])
+        for name in ("t", "x", "y", "p"):
+            np.testing.assert_array_equal(getattr(events, name), getattr(alone, name))
+    assert len({len(events) for events in together}) > 5
 
 
 def busy(half, true, load) -> np.ndarray:
