@@ -120,6 +120,7 @@ def _rows_at_a_time(stimulus: Stimulus, seeds: NDArray[np.int64], finer: NDArray
     """
     samples = len(stimulus.pixels) * stimulus.grid.steps * finer
     most = max(1, -(-(len(seeds) - 1) // launch.thread_count()))
+    # rows of a run have one seed, and one scene with as many samples as the first of them takes
     out, first = [slice(0, 1)], 1
     for n in range(2, len(seeds) + 1):
         alike = n < len(seeds) and seeds[n] == seeds[first] and finer[n] == finer[first]
