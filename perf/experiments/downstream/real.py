@@ -157,9 +157,10 @@ def main() -> None:
     log = args.out / "results.jsonl"
     # published networks have rows, and no trainings
     rows = [row for row in read_rows(str(log)) if row["kind"] in KINDS] if log.exists() else []
-    # trainings of other lengths are neither done nor to be averaged with these
-    if {row["steps"] for row in rows} - {size.reconstruction_steps}:
-        ask.error(f"{log} has trainings of another number of steps than {size.reconstruction_steps}")
+    # trainings of other lengths are neither done nor to be averaged with these, nor those of other scenes
+    asked = size.reconstruction_steps, size.scene_batches
+    if {(row["steps"], row.get("scene_batches", 1)) for row in rows} - {asked}:
+        ask.error(f"{log} has trainings of other steps, or batches of a scene, than {asked[0]} and {asked[1]}")
     done = {(row["kind"], row["seed"]) for row in rows}
     # the quickest first: what is tuned is waited for
     given = {"fitted": args.fitted, "diagnosed": args.diagnosed}

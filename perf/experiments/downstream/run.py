@@ -434,11 +434,13 @@ def alone_visible(device: str) -> Iterator[None]:
     before, number = os.environ.get("CUDA_VISIBLE_DEVICES"), device.partition(":")[2]
     if number:
         os.environ["CUDA_VISIBLE_DEVICES"] = number
-    yield
-    if number and before is None:
-        del os.environ["CUDA_VISIBLE_DEVICES"]
-    elif before is not None:
-        os.environ["CUDA_VISIBLE_DEVICES"] = before
+    try:
+        yield
+    finally:
+        if before is not None:
+            os.environ["CUDA_VISIBLE_DEVICES"] = before
+        else:
+            os.environ.pop("CUDA_VISIBLE_DEVICES", None)
 
 
 def do_job(job: Job) -> list[dict[str, Any]] | None:
