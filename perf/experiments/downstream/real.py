@@ -160,7 +160,7 @@ def main() -> None:
     # trainings of other lengths are neither done nor to be averaged with these, nor those of other scenes
     asked = size.reconstruction_steps, size.scene_batches
     if {(row["steps"], row.get("scene_batches", 1)) for row in rows} - {asked}:
-        ask.error(f"{log} has trainings of other steps, or batches of a scene, than {asked[0]} and {asked[1]}")
+        ask.error(f"{log} has trainings of other steps or batches of a scene than {asked}")
     done = {(row["kind"], row["seed"]) for row in rows}
     # the quickest first: what is tuned is waited for
     given = {"fitted": args.fitted, "diagnosed": args.diagnosed}
