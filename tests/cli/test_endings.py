@@ -72,7 +72,7 @@ def test_workers_end_with_their_parent(tmp_path, number, code):
 
 
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="finds processes in /proc")
-@pytest.mark.parametrize("victims", ["group", "worker"])
+@pytest.mark.parametrize("victims", ["group", pytest.param("worker", marks=pytest.mark.slow)])
 def test_a_signal_to_the_workers(tmp_path, victims):
     out = tmp_path / "out"
     process = started("synth", out, *OPTIONS, "--sequences", 400, "--jobs", 2)

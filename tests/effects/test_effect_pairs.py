@@ -61,7 +61,9 @@ def all_on(mode: str) -> dase.Sensor:
     return sensor
 
 
-@pytest.mark.parametrize("mode", ["reset", "drop", "delay"])
+@pytest.mark.parametrize(
+    "mode", ["reset", *(pytest.param(m, marks=pytest.mark.slow) for m in ("drop", "delay"))]
+)
 def test_all_effects_on(device, rng, mode):
     grey, sensor = flicker(rng), all_on(mode)
     times = grey.sample_times()

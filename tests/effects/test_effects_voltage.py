@@ -405,8 +405,8 @@ def test_a_pixel_held_in_reset_forgets_its_phase(device):
 @pytest.mark.parametrize(
     ("ratio", "gain"),
     [
-        *((0.1, 0.0), (1.0, 0.0), (10.0, 0.0), (0.02, 50.0), (0.2, 50.0)),
-        pytest.param(30.0, 0.0, marks=pytest.mark.slow),
+        *((0.1, 0.0), (1.0, 0.0), (0.02, 50.0), (0.2, 50.0)),
+        *(pytest.param(ratio, 0.0, marks=pytest.mark.slow) for ratio in (10.0, 30.0)),
     ],
 )
 def test_the_photoreceptors_noise_sends_as_often_as_finely_sampled_noise(device, ratio, gain, rng):

@@ -52,18 +52,15 @@ def test_plain_kernels(name, tmp_path):
     compiles(wp.get_module(f"dase.kernels.{name}"), tmp_path)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
-    ("source", "sink"),
-    [
-        pytest.param("frames", "counts", marks=pytest.mark.slow),
-        ("layers", "labels"),
-        pytest.param("background", "keys", marks=pytest.mark.slow),
-    ],
+    ("source", "sink"), [("frames", "counts"), ("layers", "labels"), ("background", "keys")]
 )
 def test_pixels_with_every_effect(source, sink, tmp_path):
     compiles(pixel_compile.compose_pixels(every().stages(), source, sink).module, tmp_path)
 
 
+@pytest.mark.slow
 def test_pixels_of_many_scenes(tmp_path):
     compiles(pixel_codegen_scenes.compose_scenes(every().stages(), "layers", "voxels").module, tmp_path)
 

@@ -163,7 +163,10 @@ def same(one, other) -> bool:
     [
         {"network": NetworkShape(channels=4, depth=1, table=(3, 2), split=True, pattern=(SIDE, SIDE))},
         pytest.param(WGAN, marks=pytest.mark.slow),
-        {**WGAN, "optimizer": "adabelief", "adversarial": replace(CRITICS, critic_image=True)},
+        pytest.param(
+            {**WGAN, "optimizer": "adabelief", "adversarial": replace(CRITICS, critic_image=True)},
+            marks=pytest.mark.slow,
+        ),
     ],
     ids=["moments", "wgan", "adabelief"],
 )

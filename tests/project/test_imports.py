@@ -147,6 +147,7 @@ def test_kernels_know_nothing_of_dase():
             assert all(one.module.startswith("dase.kernels") for one in found), module
 
 
+@pytest.mark.slow
 def test_no_import_starts_warp():
     """With Warp starts CUDA: a process that forks or chooses its GPU after an import would be too late."""
     pytest.importorskip("torch")

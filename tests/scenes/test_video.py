@@ -275,12 +275,13 @@ def test_good_videos_of_every_codec_open(tmp_path, suffix, code):
     np.testing.assert_allclose(got.frame_times, np.arange(3) / 25)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("suffix", "code", "size"),
     [
         ("webm", "VP80", (3840, 2160)),
-        pytest.param("avi", "MJPG", (3840, 2160), marks=pytest.mark.slow),
-        pytest.param("webm", "VP90", (2560, 2556), marks=pytest.mark.slow),
+        ("avi", "MJPG", (3840, 2160)),
+        ("webm", "VP90", (2560, 2556)),
     ],
 )
 def test_the_largest_plain_frames_take_little_memory(tmp_path, suffix, code, size):
@@ -355,6 +356,7 @@ def grown_webm(small: bytes, large: bytes) -> bytes:
     return small[: small.index(cluster)] + small[small.index(cluster) :].split(b"\x1c\x53\xbb\x6b")[0] + last
 
 
+@pytest.mark.slow
 def test_frames_far_larger_than_the_head_says_are_not_decoded(tmp_path):
     """A frame of VP8 may change the size; OpenCV shrinks it, when FFmpeg has decoded it, without a word."""
     if ffmpeg._find_libavutil() is None:

@@ -622,6 +622,7 @@ def recorded(shared, name):
     return looked, {entry.name for entry in looked.found}
 
 
+@pytest.mark.slow
 def test_camera_shake(shared):
     looked, names = recorded(shared, "davis240c_camerashake")
     assert {"frame coupling", "flicker", "grouping"} <= names
