@@ -124,7 +124,11 @@ class ComparedMeasurement:
         )
 
     def strength_of_bursts(
-        self, seen: SeenEffects, sensor: Sensor, library: Mapping[str, type[Effect]]
+        self,
+        seen: SeenEffects,
+        sensor: Sensor,
+        library: Mapping[str, type[Effect]],
+        begin: Effect | None = None,
     ) -> BurstStrength | None:
         """Return the effect that makes the bursts; see `dase.diagnosis.seen_effects.strength_of_bursts`.
 
@@ -132,9 +136,10 @@ class ComparedMeasurement:
             seen: In the events, less what is of the scene.
             sensor: Without the effect.
             library: Effects, name to class.
+            begin: The effect as it was fitted beside another model; None before the first fit.
         """
         return strength_of_bursts(
-            seen, self.measurement, sensor, library,
+            seen, self.measurement, sensor, library, begin,
             pixels=self.pixels, plenty=self.parts.plenty, seed=self.seed, device=self.device,
         )  # fmt: skip
 

@@ -294,6 +294,6 @@ def _with_what_pixels_show(
         task.progress("how strong the bursts are", 0.95, found.errors[-1])
         # beside other effects it may be another
         bare = found.sensor.without(strength.effect.name)
-        last = compared.strength_of_bursts(seen, bare, task.effects)
+        last = compared.strength_of_bursts(seen, bare, task.effects, strength.effect)
         found = with_effect_of_bursts(found, last or strength)
     return found

@@ -399,6 +399,7 @@ def strength_of_bursts(
     measurement: Measurement,
     sensor: Sensor,
     library: Mapping[str, type[Effect]],
+    begin: Effect | None = None,
     *,
     pixels: int,
     plenty: float,
@@ -412,6 +413,7 @@ def strength_of_bursts(
         measurement: With the bursts.
         sensor: Without the effect.
         library: Effects, name to class.
+        begin: The effect as it was fitted beside another model; None before the first fit.
         pixels: In each part of the measurement.
         plenty: Events about the bursts from which on a longer time is not looked at.
         seed: Of every random number.
@@ -423,7 +425,7 @@ def strength_of_bursts(
     for name in seen.identified_by(entry):
         if name in library and name not in sensor:
             return fit_bursts(
-                measurement, sensor, library[name], times,
+                measurement, sensor, library[name], times, begin,
                 pixels=pixels, plenty=plenty, seed=seed, device=device,
             )  # fmt: skip
     return None

@@ -117,6 +117,7 @@ def fit_bursts(
     sensor: Sensor,
     kind: type[Effect],
     times: BurstTimes,
+    begin: Effect | None = None,
     *,
     pixels: int = SPLIT.pixels,
     plenty: float = math.inf,
@@ -130,6 +131,7 @@ def fit_bursts(
         sensor: All else, which is not fitted.
         kind: The effect.
         times: When the bursts come; little else is compared.
+        begin: The effect as it was fitted beside another model; None looks for where to begin.
         pixels: In each part of the measurement.
         plenty: Events about the bursts, of one part, from which on a longer time is not looked at.
         seed: Of every random number.
@@ -154,11 +156,15 @@ def fit_bursts(
         )  # fmt: skip
     except InputError:
         return None
-    tried = kind.candidates(evidence.observe(idle_bus=0.0))
-    if not tried:
-        return None
-    models = [_fitted_to_bursts(evidence, sensor, effect, seed=seed) for effect in tried]
-    model, values = estimate_parameters(evidence, min(models, key=lambda m: m.loss), seed=seed)
+    if begin is None:
+        tried = kind.candidates(evidence.observe(idle_bus=0.0))
+        if not tried:
+            return None
+        models = [_fitted_to_bursts(evidence, sensor, effect, seed=seed) for effect in tried]
+        near = min(models, key=lambda m: m.loss)
+    else:  # beside other effects its values change by little, and last steps find them
+        near = _effect_alone_free(sensor, begin)
+    model, values = estimate_parameters(evidence, near, seed=seed)
     without, with_it = (
         one.judge(evidence.report, repeats=REPEATS // 2, seed=SimulationStream.JUDGE.seed(seed)).error
         for one in (model_of(sensor, ()), model)
@@ -177,11 +183,16 @@ def _fitted_to_bursts(
     evidence: SplitMeasurement, sensor: Sensor, effect: Effect, *, seed: int
 ) -> FittedModel:
     """Return the sensor with the effect, whose parameters alone are fitted."""
-    together = sensor.with_effect(effect)
-    free: Sequence[str] = [axis.name for axis in axes_of(together) if axis.effect is type(effect)]
-    model = model_of(together, free)
+    model = _effect_alone_free(sensor, effect)
     stream = SimulationStream.CALIBRATE_FIT.seed(seed)
     half = model.calibrate(evidence.scout, repeats=12, seed=stream)
     places, losses = run_work(ranking_work(half, model.space, starting_places(model, effect), seed=seed))
     found = FittedModel(model.space, places[0], losses[0])
     return refit_model(evidence, found, seed=seed, rounds=1)
+
+
+def _effect_alone_free(sensor: Sensor, effect: Effect) -> FittedModel:
+    """Return the sensor with the effect at its values, before any fit of its parameters alone."""
+    together = sensor.with_effect(effect)
+    free: Sequence[str] = [axis.name for axis in axes_of(together) if axis.effect is type(effect)]
+    return model_of(together, free)

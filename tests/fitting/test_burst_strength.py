@@ -92,6 +92,21 @@ def test_the_strength_is_that_of_the_sensor(scene, device, amplitude, spread):
     assert got.spread == pytest.approx(spread, rel=0.34)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("times", [0.7, 1.3])
+def test_last_steps_find_the_strength_from_near_it(scene, device, times):
+    """Beside other effects a strength is another one; it is not looked for from afar again."""
+    events = dase.simulate(scene, dase.Sensor().with_effect(FRAMES), seed=1, device=device)
+    begin = replace(FRAMES, amplitude=times * FRAMES.amplitude)
+    found = fit_bursts(
+        Measurement(events, scene), dase.Sensor(), Exposure, TIMES, begin, pixels=300, device=device
+    )
+    assert found is not None
+    got = found.effect
+    assert isinstance(got, Exposure)
+    assert got.amplitude == pytest.approx(FRAMES.amplitude, rel=0.15)
+
+
 def test_a_sensor_takes_the_times_of_the_measurement(scene, device):
     """Of a sensor file the strength counts: its clock is that of other frames."""
     wrong = dase.Sensor().with_effect(Exposure(amplitude=0.4, period=0.04, exposure=0.01, begin=0.003))
