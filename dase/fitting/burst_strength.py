@@ -192,7 +192,7 @@ def _fitted_to_bursts(
 
 
 def _effect_alone_free(sensor: Sensor, effect: Effect) -> FittedModel:
-    """Return the sensor with the effect at its values, before any fit of its parameters alone."""
+    """Return the sensor with the effect, at its values, whose parameters alone are free."""
     together = sensor.with_effect(effect)
     free: Sequence[str] = [axis.name for axis in axes_of(together) if axis.effect is type(effect)]
     return model_of(together, free)
