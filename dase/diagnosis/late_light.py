@@ -354,6 +354,11 @@ def _least(
     return float(found.fun), [float(one) for one in found.x]
 
 
+def time_of_delay(entry: Signature) -> float:
+    """Return how late events are [s] by a signature of `find_late_events`: its delay, or that of its pole."""
+    return entry.size if entry.unit == "s" else 1 / (2 * math.pi * entry.size)
+
+
 def _signatures_of(way: Way, at_once: float) -> tuple[Signature, ...]:
     """Return what a way shows: a latency, a pole or two, or a pole and a latency.
 

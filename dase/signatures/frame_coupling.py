@@ -29,6 +29,8 @@ class CouplingSettings:
     """What counts as a burst, and as a clock."""
 
     least: float = 2.0  # times the usual rate
+    # the same, at which bursts are looked for: lower where there are none, for a lamp may reach that as well
+    high: tuple[float, ...] = (4.0, 2.5)
     fewest_frames: int = 7  # with less not even the same moment in each frame is significant
     fewest_events: float = 50.0  # per frame interval and polarity
     usual: float = 0.02  # [s] its median is the usual rate: longer than a burst, shorter than a scene
@@ -146,15 +148,17 @@ def _is_lamp(mean: NDArray[np.float64], at: int, step: float, s: CouplingSetting
     return False
 
 
-def _find_bursts(counts: NDArray[np.uint32], step: float, s: CouplingSettings) -> list[NDArray[np.int64]]:
-    """Return the steps of bursts of the whole array, OFF and ON: many tiles, and many times the usual."""
+def _find_bursts(
+    counts: NDArray[np.uint32], step: float, high: float, s: CouplingSettings
+) -> list[NDArray[np.int64]]:
+    """Return the steps of bursts of the whole array, OFF and ON: many tiles, and `high` times the usual."""
     out = []
     for polarity in range(2):
         per_tile = counts[:, polarity].astype(np.float64)
         total = per_tile.sum(1)
         usual = _usual_rate(total, step, s)
         share = per_tile.mean(0) / max(per_tile.mean(), 1e-12) / per_tile.shape[1]
-        rows = np.flatnonzero((total > 4 * usual + 20) & (total - usual > 10 * np.sqrt(usual + 1)))
+        rows = np.flatnonzero((total > high * usual + 20) & (total - usual > 10 * np.sqrt(usual + 1)))
         peaks = []
         for group in np.split(rows, np.flatnonzero(np.diff(rows) > 4) + 1):
             if not len(group):
@@ -255,25 +259,46 @@ def find_frame_coupling(
         The signature, and when the bursts are, where there are any.
     """
     s = settings or CouplingSettings()
-    step = clock.settings.step
-    counts = clock.counts
-    p = None
     if begins is not None and len(begins) >= 2:
         interval = float(np.median(np.diff(begins)))
-        begins = np.asarray(begins, np.float64)
-        told = "frames"
-    else:
-        found = _search_bursts(clock, s)
-        if found is None:
-            if len(counts) * step < 0.3:
-                reason = f"{format_seconds(len(counts) * step)} without known frame times, too short"
-                return without_answer(FRAME_COUPLING, reason), None
-            unseen = "no frame times known, no regular bursts of the whole array"
-            return Signature(
-                name=FRAME_COUPLING, answer=Answer.NOT_SEEN, p=1.0, least=s.least, sentence=unseen
-            ), None
-        begins, interval, p = found
-        told = "bursts"
+        return _look_in_step(clock, np.asarray(begins, np.float64), interval, None, level, s)
+    answers = []
+    for high in s.high:
+        found = _search_bursts(clock, high, s)
+        if found is not None:
+            answers.append(_look_in_step(clock, *found, level, s))
+            if answers[-1][0].found:
+                return answers[-1]
+    if answers:
+        return answers[0]
+    lasts = len(clock.counts) * clock.settings.step
+    if lasts < 0.3:
+        reason = f"{format_seconds(lasts)} without known frame times, too short"
+        return without_answer(FRAME_COUPLING, reason), None
+    unseen = "no frame times known, no regular bursts of the whole array"
+    return Signature(name=FRAME_COUPLING, answer=Answer.NOT_SEEN, p=1.0, least=s.least, sentence=unseen), None
+
+
+def _look_in_step(
+    clock: ClockCounts,
+    begins: NDArray[np.float64],
+    interval: float,
+    p: float | None,
+    level: float,
+    s: CouplingSettings,
+) -> tuple[Signature, BurstClock | None]:
+    """Look for bursts in step with frames whose times are known, or told by bursts.
+
+    Args:
+        clock: The events by time.
+        begins: When frames begin [s], shape (F,).
+        interval: Time from one to the next [s].
+        p: Chance of bursts that tell as even times; None where frames tell them.
+        level: p below which they are there.
+        s: What counts as a burst.
+    """
+    told = "frames" if p is None else "bursts"
+    step, counts = clock.settings.step, clock.counts
     if interval < s.shortest:
         reason = f"{told} come every {format_seconds(interval)}, as often as lamps flicker"
         return without_answer(FRAME_COUPLING, reason), None
@@ -290,11 +315,11 @@ def find_frame_coupling(
 
 
 def _search_bursts(
-    clock: ClockCounts, s: CouplingSettings
+    clock: ClockCounts, high: float, s: CouplingSettings
 ) -> tuple[NDArray[np.float64], float, float] | None:
     """Return times in step with bursts of the whole array [s], their interval [s], and its p."""
     best = None
-    for peaks in _find_bursts(clock.counts, clock.settings.step, s):
+    for peaks in _find_bursts(clock.counts, clock.settings.step, high, s):
         if len(peaks) < s.fewest_frames:
             continue
         times = clock.times[peaks]

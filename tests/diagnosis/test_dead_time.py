@@ -12,6 +12,7 @@ from helpers.brief_diagnosis import NO_LIMITS
 import dase
 from dase.diagnosis import seen_beside_model
 from dase.diagnosis.dead_time import DEAD_TIME, end_of_intervals, find_dead_time, intervals_of
+from dase.diagnosis.late_light import time_of_delay
 from dase.diagnosis.seen_effects import SeenEffects
 from dase.diagnosis.state import EventsAlone
 from dase.effects import EFFECTS
@@ -214,7 +215,12 @@ def test_a_dead_time_that_was_put_off_is_asked_for_beside_the_last_model(monkeyp
     entry = Signature(name=kinds.DEAD_TIME, answer=Answer.FOUND, sentence="seen", details={"period": 2e-3})
     sensor = Sensor().with_effect(EFFECTS["linlog"]())
     model = model_of(sensor.with_effect(EFFECTS["refractory"](period=2e-3)) if added else sensor, None)
-    task = SimpleNamespace(added_to=lambda one: ("linlog",), effects=EFFECTS, judge=lambda one: judged(0.3))
+    task = SimpleNamespace(
+        added_to=lambda one: ("linlog",),
+        effects=EFFECTS,
+        judge=lambda one: judged(0.3),
+        evidence=SimpleNamespace(frame_step=0.0),
+    )
     put_off = EventsAlone(put_off=frozenset({"refractory"}))
     asked = []
 
@@ -230,3 +236,35 @@ def test_a_dead_time_that_was_put_off_is_asked_for_beside_the_last_model(monkeyp
     assert seen.entry_of(kinds.DEAD_TIME) is None
     assert last is model  # what the error asks for stays, and is graded by it
     assert [("refractory" in one, "linlog" in one) for one in asked] == [(False, True)]
+
+
+@pytest.mark.parametrize(
+    ("frame_step", "also", "kept"),
+    [
+        (1e-3, {}, [8e-3]),
+        (0.0, {}, [1 / (2 * np.pi * 122), 8e-3]),
+        (1e-3, {"bandwidth": {"cutoff": 122.0}}, None),
+    ],
+)
+def test_what_a_dead_time_puts_off_to_the_next_frame_is_no_low_pass(monkeypatch, frame_step, also, kept):
+    late = [
+        Signature(name=kinds.LATE_EVENTS, answer=Answer.FOUND, p=0.0, size=size, unit=unit, sentence="late")
+        for size, unit in ((122.0, "Hz"), (8e-3, "s"))
+    ]
+    sensor = Sensor().with_effect(EFFECTS["refractory"](period=1.2e-3))
+    for name, values in also.items():
+        sensor = sensor.with_effect(EFFECTS[name](**values))
+    task = SimpleNamespace(
+        added_to=lambda one: ("refractory", *also),
+        effects=EFFECTS,
+        evidence=SimpleNamespace(frame_step=frame_step),
+    )
+    monkeypatch.setattr(seen_beside_model, "_look_for_dead_time", lambda task, seen, *rest: seen)
+    monkeypatch.setattr(
+        seen_beside_model, "_without_needless_dead_time", lambda task, seen, m, *rest: (seen, *rest)
+    )
+    seen, _ = seen_beside_model.settle_dead_time(
+        task, EventsAlone(), SeenEffects(tuple(late)), None, model_of(sensor, None), judged(0.3)
+    )
+    times = [time_of_delay(one) for one in seen.entries]
+    assert times == pytest.approx(kept or [1 / (2 * np.pi * 122), 8e-3])

@@ -165,6 +165,39 @@ def test_few_bursts_that_all_keep_step_are_enough():
     assert entry.details["interval"] == pytest.approx(0.05, rel=2e-3)
 
 
+def pulses(rng, every, many, lasts=5e-4):
+    """Times of events: each `every` seconds about `many` in a span."""
+    begins = np.arange(0.004, 0.99, every)
+    return np.concatenate([rng.uniform(t, t + lasts, rng.poisson(many)) for t in begins])
+
+
+def anywhere(rng, times):
+    """Events at times, at any pixel, of any polarity."""
+    n = len(times)
+    return dase.Events(
+        np.sort(times), rng.integers(0, 100, n), rng.integers(0, 80, n), rng.random(n) < 0.5, 100, 80
+    )
+
+
+def test_bursts_of_three_times_the_usual_rate_are_seen(rng):
+    """4 % of the pixels of a clip of ESIM's rules sent with each frame: below what is looked for at first."""
+    usual = rng.uniform(0.0, 1.0, 300_000)
+    entry = dase.find_signatures(anywhere(rng, np.concatenate([usual, pulses(rng, 0.02, 700, 1e-3)])))[
+        "frame coupling"
+    ]
+    assert entry.found
+    assert entry.details["interval"] == pytest.approx(0.02, rel=2e-3)
+    assert not dase.find_signatures(anywhere(rng, usual))["frame coupling"].found
+
+
+def test_bursts_above_a_lamp_keep_the_time_of_the_frames(rng):
+    """A lamp as high as weak bursts would be looks like one of bursts that come too often for frames."""
+    parts = rng.uniform(0.0, 1.0, 300_000), pulses(rng, 0.01, 400), pulses(rng, 0.046, 3000)
+    entry = dase.find_signatures(anywhere(rng, np.concatenate(parts)))["frame coupling"]
+    assert entry.found
+    assert entry.details["interval"] == pytest.approx(0.046, rel=2e-3)
+
+
 def test_bursts_keep_step_among_others(rng):
     others = np.sort(np.concatenate([0.007 + 0.05 * np.arange(16), rng.uniform(0.0, 0.8, 10)]))
     period, p = _find_period(np.round(others / 5e-4) * 5e-4, 5e-4, CouplingSettings())
