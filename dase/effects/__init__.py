@@ -58,8 +58,8 @@ _ORDER = (
     Bandwidth,
     SecondOrder,
     VoltageNoise,
-    HighPass,
     Exposure,
+    HighPass,
     # change detector
     Threshold,
     LearnedThreshold,

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import warp as wp
 
-from dase.effects.base import Effect, parameter
+from dase.effects.base import Effect, choice, parameter
+from dase.kernels.pixel_stages import REST, EffectStages
 from dase.kernels.vector_math import exponential
 
 
@@ -26,18 +27,41 @@ def highpass(voltage: float, dt: float, cutoff: float, input: float, output: flo
     return passed, voltage, passed
 
 
+@wp.func
+def fading_change(
+    voltage: float, dt: float, signal: float, before: float, cutoff: float, input: float, output: float
+):
+    """A voltage that comes back to the pixel's memory as the change since its last event fades."""
+    memory = signal - before  # what acts behind this one is in both
+    passed, _, _ = highpass(voltage, dt, cutoff, input, output - memory)
+    passed += memory
+    # the memory begins at the first voltage, from which nothing has faded
+    passed = wp.where(dt >= REST, voltage, passed)
+    if cutoff == 0.0:
+        passed = voltage
+    return passed, voltage, passed
+
+
 @dataclass(frozen=True, kw_only=True)
 class HighPass(Effect):
     """Slow changes are forgotten before they make events.
 
     Some sensors, such as Prophesee's with their bias `bias_hpf`, couple the photoreceptor to the change
     detector through a high-pass. Changes slower than its cutoff fade before they reach a threshold: slow
-    motion, drifting light and the background go, fast motion and flicker stay. What an edge left behind is
-    forgotten, too, so a pixel sends events of the other polarity after a bright object has rested on it.
+    motion, drifting light and the background go, fast motion and flicker stay.
 
-    Behind it the voltage v follows dv/dt = du/dt - 2π cutoff v, u being the photoreceptor's. A step of
-    contrast c leaves c · exp(-2π cutoff t) after the time t; a ramp of slope s ends at s / (2π cutoff), below
+    Where it stands is `at`. At the `"input"` of the change detector it is a filter of its own: the voltage v
+    behind it follows dv/dt = du/dt - 2π cutoff v, u being the photoreceptor's, whatever events come. A step
+    of contrast c leaves c · exp(-2π cutoff t) after the time t, so a pixel sends as many events of the other
+    polarity after a bright object has come to rest on it. A ramp of slope s ends at s / (2π cutoff), below
     the threshold if it is slow enough.
+
+    At the `"memory"` it is a resistor across the capacitor of the change detector, which each event
+    discharges: the change d since the last event follows dd/dt = du/dt - 2π cutoff d and begins at 0 anew.
+    What a step leaves below a threshold is forgotten without an event; a ramp of slope s sends an event each
+    -log(1 - 2π cutoff threshold / s) / (2π cutoff), and none below s = 2π cutoff threshold. A leak, which
+    moves the memory at a speed of its own, sends nothing either if it is as slow. What Prophesee's pixel does
+    is not published; other simulators have the one or the other.
     """
 
     name: ClassVar[str] = "high_pass"
@@ -58,3 +82,13 @@ class HighPass(Effect):
         plausible=(0.05, 100.0),
         about="-3 dB frequency below which changes are lost",
     )
+    at: str = choice(
+        "input",
+        among=("input", "memory"),
+        about="what fades: the input of the change detector, or the change since its last event",
+    )
+
+    def compiled(self) -> EffectStages:
+        """Return what the kernel composer needs to know: each place has a function of its own."""
+        respond = highpass if self.at == "input" else fading_change
+        return replace(super().compiled(), functions=(("respond", respond),))

@@ -6,6 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from helpers.sensors import counts
+from reference import effects as reference
 from scipy.stats import norm
 
 import dase
@@ -13,6 +15,7 @@ from dase.effects.bandwidth import Bandwidth
 from dase.effects.base import Observations
 from dase.effects.exposure import Exposure
 from dase.effects.high_pass import HighPass
+from dase.effects.leak import Leak
 from dase.effects.threshold import Threshold
 from dase.effects.voltage_noise import VoltageNoise
 from dase.fitting.parameter_space import axes_of
@@ -152,3 +155,125 @@ def test_a_high_pass_cuts_what_is_slow_of_the_noise_and_leaves_what_is_fast(devi
     assert rates[0] > 2000
     assert abs(rates[1] / rates[0] - 1) < 0.1
     assert rates[2] < 0.2 * rates[0]
+
+
+def fading(cutoff: float) -> HighPass:
+    """Return a high-pass at the memory of the change detector."""
+    return HighPass(cutoff=cutoff, at="memory")
+
+
+@pytest.mark.parametrize("cutoff", [0.5, 5.0, 50.0])
+def test_what_a_step_leaves_below_a_threshold_fades_without_an_event(device, cutoff):
+    samples, contrast, theta = 2001, 1.05, 0.1
+    frames = np.full((samples, 1, 3), 0.2, np.float32)
+    frames[100:] *= np.exp(contrast)
+    scene = dase.VideoScene(frames, np.arange(samples) * 2e-4)
+    events = dase.simulate(scene, sensor(fading(cutoff), on=theta, off=theta), device=device)
+    mine = events.select(events.x == 1)
+    assert mine.p.all()
+    # within the sample that the step takes a change fades as in the filter
+    rate = 2 * np.pi * cutoff * 2e-4
+    assert len(mine) == int(contrast * (1 - np.exp(-rate)) / rate / theta)
+
+
+@pytest.mark.parametrize("theta", [0.1, 0.25])
+@pytest.mark.parametrize("cutoff", [0.3, 1.0])
+def test_a_ramp_sends_events_as_a_leaky_integrator_fires(device, theta, cutoff):
+    """dd/dt = s - 2π f d from 0 reaches the threshold θ after -log(1 - 2π f θ / s) / (2π f)."""
+    times = np.arange(4001) * 2.5e-4
+    slopes = 2 * np.pi * cutoff * theta * np.array([0.5, 0.95, 1.1, 2.0, 6.0])
+    slopes *= np.where(np.arange(5) == 3, -1, 1)
+    frames = 0.9 * np.exp(slopes * (times[:, None] - np.where(slopes > 0, times[-1], 0.0)))[:, None]
+    scene = dase.VideoScene(frames.astype(np.float32), times)
+    plain = replace(sensor(fading(cutoff), on=theta, off=theta), log_eps=1e-9)
+    events = dase.simulate(scene, plain, device=device)
+    assert not np.isin(events.x, [0, 1]).any()
+    rate = 2 * np.pi * cutoff
+    for x in (2, 3, 4):
+        want = -np.log(1 - rate * theta / abs(slopes[x])) / rate
+        mine = events.select(events.x == x)
+        assert np.all(mine.p == (slopes[x] > 0))
+        assert len(mine) == pytest.approx(times[-1] / want, rel=0.01, abs=1)
+        if len(mine) > 1:
+            np.testing.assert_allclose(np.diff(mine.t), want, rtol=0.02)
+
+
+def test_a_leak_slower_than_the_memory_forgets_sends_nothing(device):
+    theta, rate = 0.2, 5.0
+    for cutoff, fires in ((1.2, False), (0.4, True)):
+        leaky = sensor(Leak(rate=rate, spread=0.0), fading(cutoff), on=theta, off=theta)
+        events = dase.simulate(still(8, 4.0), leaky, device=device)
+        # it fades faster than a threshold leaks: 2π cutoff > rate
+        assert (2 * np.pi * cutoff < rate) == fires
+        want = -np.log(1 - 2 * np.pi * cutoff / rate) / (2 * np.pi * cutoff) if fires else np.inf
+        assert len(events) / 8 == pytest.approx(4.0 / want, abs=1.01 if fires else 0)
+
+
+def test_bursts_of_frames_do_not_add_up_at_a_memory_that_forgets(device):
+    frames = Exposure(amplitude=0.45, spread=0.0, period=0.1, exposure=0.03, begin=0.0205)
+    plain, slow = (
+        dase.simulate(still(64, 2.0), sensor(frames, *more, off=0.199), device=device)
+        for more in ((), (fading(0.01),))
+    )
+    assert len(plain) > 1000
+    assert len(slow) == pytest.approx(len(plain), rel=0.02)
+
+
+def leaky_counts(level: np.ndarray, step: float, rate: float, on: float, off: float) -> np.ndarray:
+    """Return ON and OFF events of pixels whose change fades, by small steps, shape (2, N).
+
+    Args:
+        level: Voltage, which runs straight between samples, shape (K, N).
+        step: Between them [s].
+        rate: 2π times the cutoff [1/s].
+        on: Threshold.
+        off: Threshold.
+    """
+    parts, out = 16, np.zeros((2, level.shape[1]), np.int64)
+    change = np.zeros(level.shape[1])
+    for ahead in np.diff(level, axis=0):
+        for _ in range(parts):
+            change += ahead / parts - rate * step / parts * (change + 0.5 * ahead / parts)
+            many = np.where(change > 0, np.floor(change / on), -np.floor(-change / off)).astype(int)
+            out[0] += np.maximum(many, 0)
+            out[1] += np.maximum(-many, 0)
+            change -= np.where(many > 0, many * on, many * off)
+    return out
+
+
+@pytest.mark.parametrize("cutoff", [0.3, 3.0, 20.0])
+@pytest.mark.parametrize("noisy", [False, True])
+def test_a_memory_that_forgets_is_that_of_small_steps(device, cutoff, noisy):
+    """Before random light, alone, and behind a low-pass with noise of the voltage."""
+    rng = np.random.default_rng(3)
+    times = np.arange(1001) * 1e-3
+    waves = sum(
+        a * np.sin(2 * np.pi * f * times[:, None] + p)
+        for a, f, p in zip(
+            (0.8, 0.5, 0.25), (1.0, 4.0, 11.0), rng.uniform(0, 2 * np.pi, (3, 40)), strict=True
+        )
+    )
+    frames = (0.2 * np.exp(waves - 0.3)).astype(np.float32)
+    before = (Bandwidth(cutoff=60.0), VoltageNoise(sigma=0.05, cutoff=30.0)) if noisy else ()
+    bare = sensor(*before, on=0.17, off=0.21)
+    scene = dase.VideoScene(np.minimum(frames, 1.0)[:, None], times)
+    level = reference.voltage(bare, times, np.minimum(frames, 1.0), 4)
+    want = leaky_counts(level - level[0], 1e-3, 2 * np.pi * cutoff, 0.17, 0.21)
+    got, filtered = (
+        counts(scene, bare.with_effect(one), 1.0, device, seed=4)[::-1]
+        for one in (fading(cutoff), HighPass(cutoff=cutoff))
+    )
+    assert want.sum() > 100
+    assert got.sum() == pytest.approx(want.sum(), rel=0.01)
+    assert np.abs(got - want).max() <= 2
+    # a filter before the memory is another effect
+    assert np.abs(filtered - want).sum() > 4 * np.abs(got - want).sum()
+
+
+def test_off_is_off_at_the_memory_too(device):
+    scene = dase.VideoScene(
+        np.random.default_rng(0).uniform(0.1, 1, (50, 4, 6)).astype(np.float32), np.arange(50) * 1e-3
+    )
+    plain, off = (dase.simulate(scene, sensor(*more), device=device) for more in ((), (fading(0.0),)))
+    assert len(plain) > 100
+    np.testing.assert_array_equal(plain.t, off.t)

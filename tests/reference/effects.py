@@ -287,8 +287,6 @@ def voltage(sensor: dase.Sensor, times: np.ndarray, intensity: np.ndarray, seed:
         radius, angle = np.sqrt(-2 * np.log(1 - first)), 2 * np.pi * second
         normals = radius * np.cos(angle), radius * np.sin(angle)
         level = level + voltage_noise(times, intensity, sensor, np.array(normals))
-    if setting(sensor, "high_pass", "cutoff", 0.0) > 0:
-        level = high_pass(times, level, sensor["high_pass"].cutoff)
     if setting(sensor, "exposure", "amplitude", 0.0) != 0:
         frames = sensor["exposure"]
         normal = np.array(
@@ -296,6 +294,8 @@ def voltage(sensor: dase.Sensor, times: np.ndarray, intensity: np.ndarray, seed:
         )
         high = exposed(times, frames.period, frames.exposure, frames.begin)
         level = level + high[:, None] * frames.amplitude * (1 + frames.spread * normal)
+    if setting(sensor, "high_pass", "cutoff", 0.0) > 0:
+        level = high_pass(times, level, sensor["high_pass"].cutoff)
     return level
 
 
