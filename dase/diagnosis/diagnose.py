@@ -58,7 +58,7 @@ from dase.probes.random_streams import SimulationStream
 from dase.probes.stimulus import Trust
 from dase.results import Diagnosis, Progress, is_worse
 from dase.scenes.grey_steps import grey_step_of
-from dase.signatures.kinds import DEAD_TIME, DOUBLE_EVENTS, UNEQUAL_THRESHOLDS
+from dase.signatures.kinds import DEAD_TIME, DOUBLE_EVENTS, OPPOSITE_PAIRS, UNEQUAL_THRESHOLDS
 from dase.simulation.sensor import Sensor
 from dase.simulation.sensor_file import as_sensor
 
@@ -279,7 +279,7 @@ def _with_what_pixels_show(
     if forgets and REFRACTORY in task.effects and not contradicted:
         found = with_longer_dead_time(found, task, measurement, model)
     if JITTER in task.given and JITTER not in compared.given:
-        found = with_jitter_of_events(found, model.sensor)
+        found = with_jitter_of_events(found, model.sensor, noisy=seen.entry_of(OPPOSITE_PAIRS) is not None)
     if not contradicted:
         found = with_direct_readings(found, task, measurement)
     if unequal is not None and MISMATCH in task.effects:

@@ -20,6 +20,7 @@ from dase.effects.latency import Latency
 from dase.effects.refractory import Refractory
 from dase.effects.timestamp import Timestamp
 from dase.effects.vignetting import Vignetting
+from dase.effects.voltage_noise import VoltageNoise
 from dase.fitting.delays_after_frames import DelaysAfterFrames, delays_after_frames
 from dase.fitting.held_events import HeldEvents
 from dase.fitting.measurement import Measurement
@@ -162,12 +163,16 @@ def _are_drawn_anew(found: DrawnThresholds, settings: ReadingSettings) -> bool:
     return abs(found.own) <= settings.own
 
 
-def with_jitter_of_events(found: Diagnosis, model: Sensor, settings: ReadingSettings = READINGS) -> Diagnosis:
+def with_jitter_of_events(
+    found: Diagnosis, model: Sensor, *, noisy: bool = False, settings: ReadingSettings = READINGS
+) -> Diagnosis:
     """Return a diagnosis in which a jitter is certain that its model had before the search.
 
     Args:
         found: By the search.
         model: Has a jitter that was read off.
+        noisy: Whether pixels at rest send noise that returns. Noise of the voltage adds to the way to a
+            threshold what it is at each frame, so that either is possible.
         settings: From which size on it is a finding.
     """
     effect = model[Jitter.name]
@@ -181,7 +186,18 @@ def with_jitter_of_events(found: Diagnosis, model: Sensor, settings: ReadingSett
     sentence = (
         f"thresholds are drawn anew at each event, with a spread of {spread}: frames lie on either side"
     )
-    return _with_certain(found, effect, sentence, mine)
+    said = _with_certain(found, effect, sentence, mine)
+    if not noisy:
+        return said
+    return replace(
+        said,
+        findings=tuple(
+            replace(one, grade=Grade.EITHER, alternatives=(VoltageNoise.name,))
+            if one.effect == Jitter.name
+            else one
+            for one in said.findings
+        ),
+    )
 
 
 def _effects_of(

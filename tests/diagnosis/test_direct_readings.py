@@ -9,7 +9,7 @@ from helpers.frame_simulator import HEIGHT, WIDTH, shaken_texture
 from helpers.held_pixels import held_with_low_pass
 
 import dase
-from dase.diagnosis.direct_readings import READINGS, _effects_of
+from dase.diagnosis.direct_readings import READINGS, _effects_of, with_jitter_of_events
 from dase.effects import EFFECTS
 from dase.fitting.delays_after_frames import DelaysAfterFrames
 from dase.results import Diagnosis, Grade
@@ -41,6 +41,22 @@ def test_latency_stamps_and_jitter_are_certain(scene):
     for name, value in truth.items():
         assert found.parameters[name].value == pytest.approx(value, rel=0.1)
     assert len(found.errors) == len(found.selected) + 1
+
+
+@pytest.mark.parametrize(
+    ("spread", "noisy", "said"),
+    [
+        (0.15, False, (Grade.CERTAIN, ())),
+        (0.15, True, (Grade.EITHER, ("voltage_noise",))),
+        (0.03, True, None),
+    ],
+)
+def test_a_jitter_beside_noise_that_returns_may_be_that(spread, noisy, said):
+    model = dase.Sensor().with_effect(EFFECTS["jitter"](spread=spread))
+    bare = Diagnosis(model, (), (1.0,), 1.0, 1.0, 1.15, {}, None, ())
+    found = with_jitter_of_events(bare, model, noisy=noisy)
+    grades = {one.effect: (one.grade, one.alternatives) for one in found.findings}
+    assert grades == ({"jitter": said} if said else {})
 
 
 @pytest.mark.slow
