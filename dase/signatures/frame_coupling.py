@@ -262,15 +262,20 @@ def find_frame_coupling(
     if begins is not None and len(begins) >= 2:
         interval = float(np.median(np.diff(begins)))
         return _look_in_step(clock, np.asarray(begins, np.float64), interval, None, level, s)
-    answers = []
+    said: tuple[Signature, BurstClock | None] | None = None
     for high in s.high:
         found = _search_bursts(clock, high, s)
-        if found is not None:
-            answers.append(_look_in_step(clock, *found, level, s))
-            if answers[-1][0].found:
-                return answers[-1]
-    if answers:
-        return answers[0]
+        entry = _without_bursts(clock, s) if found is None else _look_in_step(clock, *found, level, s)
+        if entry[0].found:
+            return entry
+        # what else the lower limit meets is not the frames'
+        said = said or entry
+    assert said is not None
+    return said
+
+
+def _without_bursts(clock: ClockCounts, s: CouplingSettings) -> tuple[Signature, None]:
+    """Return the answer where the whole array never sends at once."""
     lasts = len(clock.counts) * clock.settings.step
     if lasts < 0.3:
         reason = f"{format_seconds(lasts)} without known frame times, too short"

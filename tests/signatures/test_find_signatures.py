@@ -190,6 +190,11 @@ def test_bursts_of_three_times_the_usual_rate_are_seen(rng):
     assert not dase.find_signatures(anywhere(rng, usual))["frame coupling"].found
 
 
+def test_what_repeats_too_often_for_frames_is_not_asked_for_below_the_first_limit(rng):
+    times = np.concatenate([rng.uniform(0.0, 1.0, 300_000), pulses(rng, 0.008, 700, 1e-3)])
+    assert dase.find_signatures(anywhere(rng, times))["frame coupling"].answer is Answer.NOT_SEEN
+
+
 def test_bursts_above_a_lamp_keep_the_time_of_the_frames(rng):
     """A lamp as high as weak bursts would be looks like one of bursts that come too often for frames."""
     parts = rng.uniform(0.0, 1.0, 300_000), pulses(rng, 0.01, 400), pulses(rng, 0.046, 3000)
