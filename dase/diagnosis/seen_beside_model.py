@@ -79,6 +79,8 @@ def settle_dead_time(
 ) -> tuple[SeenEffects, FittedModel]:
     """Return what is seen, and the last model, with a dead time if the intervals end beside that, too.
 
+    What that dead time delays to the next frame is no longer seen as late.
+
     Args:
         task: What the diagnosis is asked.
         events_alone: Whether the dead time was put off.

@@ -106,13 +106,18 @@ def test_a_search_tries_the_frames_that_are_seen_and_none_where_none_are():
     ]
 
 
+def step_of(contrast: float, samples: int) -> dase.VideoScene:
+    """Return three pixels that brighten by a contrast [log intensity] at sample 100, one each 0.2 ms."""
+    frames = np.full((samples, 1, 3), 0.2, np.float32)
+    frames[100:] *= np.exp(contrast)
+    return dase.VideoScene(frames, np.arange(samples) * 2e-4)
+
+
 @pytest.mark.parametrize("cutoff", [0.5, 5.0, 50.0])
 def test_a_step_fades(device, cutoff):
     """After the step's ON events its decay makes as many OFF events, the n-th when n thresholds are gone."""
-    samples, contrast, theta = 4001, 1.05, 0.1
-    frames = np.full((samples, 1, 3), 0.2, np.float32)
-    frames[100:] *= np.exp(contrast)
-    scene = dase.VideoScene(frames, np.arange(samples) * 2e-4)
+    contrast, theta = 1.05, 0.1
+    scene = step_of(contrast, 4001)
     events = dase.simulate(scene, sensor(HighPass(cutoff=cutoff), on=theta, off=theta), device=device)
     mine = events.select(events.x == 1)
     rate = 2 * np.pi * cutoff
@@ -164,10 +169,8 @@ def fading(cutoff: float) -> HighPass:
 
 @pytest.mark.parametrize("cutoff", [0.5, 5.0, 50.0])
 def test_what_a_step_leaves_below_a_threshold_fades_without_an_event(device, cutoff):
-    samples, contrast, theta = 2001, 1.05, 0.1
-    frames = np.full((samples, 1, 3), 0.2, np.float32)
-    frames[100:] *= np.exp(contrast)
-    scene = dase.VideoScene(frames, np.arange(samples) * 2e-4)
+    contrast, theta = 1.05, 0.1
+    scene = step_of(contrast, 2001)
     events = dase.simulate(scene, sensor(fading(cutoff), on=theta, off=theta), device=device)
     mine = events.select(events.x == 1)
     assert mine.p.all()
