@@ -51,6 +51,10 @@ class DoubleSettings:
     """Intervals from `near` to `far` per interval below `near`, at most, for doubles at times that many
     pixels share: times within a frame are not always so close."""
 
+    off_clock: float = 2.0
+    """Events at times that few pixels share per double, at most, where the clock is slower than doubles: on
+    such a clock the second of a double alone has another time."""
+
 
 class IntervalCounts:
     """Counts short intervals between events of each pixel.
@@ -71,6 +75,8 @@ class IntervalCounts:
         """
         self.events = np.zeros((2, width * height), np.int64)
         """OFF and ON events."""
+        self.at_own_times = 0
+        """Events at times that not many pixels share."""
         self._around = Events.empty(width, height)
         self._counted = 0
         self._last = np.full(width * height, -np.inf)
@@ -102,6 +108,7 @@ class IntervalCounts:
 
     def _count_intervals(self, events: Events, shared: NDArray[np.bool_]) -> None:
         pixel = row_major_pixels(events)
+        self.at_own_times += int(np.count_nonzero(~shared))
         for polarity, row in enumerate(self.events):
             row += np.bincount(pixel[events.p == polarity], minlength=len(row))
         columns = (
@@ -152,10 +159,11 @@ def find_double_events(
         intervals: Counted intervals.
         hot: Pixels to leave out, shape (H * W,).
         level: p below which they are there.
-        tick: Time between the ticks of the stamps [s]: at a slow clock, events that are not double share one.
+        tick: Time between the ticks of the stamps [s]: at a slow clock, events that are not double share one,
+            and doubles are seen only where their second leaves the ticks.
     """
     s = intervals.settings
-    if tick >= s.near:
+    if tick >= s.near and not _leave_the_clock(intervals, hot):
         return without_answer(
             DOUBLE_EVENTS, f"stamps are {format_seconds(tick)} apart, which hides what is sooner"
         )
@@ -190,6 +198,18 @@ def find_double_events(
         reason = f"{format_percent(ties / events)} of the events come at the time of the same pixel's last"
         return replace(found, answer=Answer.CANNOT_SAY, sentence=f"{reason}: a delay or a slow clock")
     return found
+
+
+def _leave_the_clock(intervals: IntervalCounts, hot: NDArray[np.bool_]) -> bool:
+    """Whether hardly anything but the second of doubles has a time that many pixels do not share.
+
+    Stamps that are spread around slow ticks bring events of one pixel close together, too, but then most
+    events have times of their own.
+    """
+    s = intervals.settings
+    doubles = int(intervals.counts[1][:, ~hot].sum())
+    enough = doubles >= s.least * int(intervals.events[:, ~hot].sum())
+    return enough and intervals.at_own_times <= s.off_clock * doubles
 
 
 def _chance_of(intervals: IntervalCounts, some: NDArray[np.bool_]) -> float:

@@ -414,6 +414,24 @@ def test_doubles_show_that_come_as_soon_after_each_frame_for_all_pixels(rng, aft
     assert dase.find_signatures(events)["double events"].found == shown
 
 
+@pytest.mark.parametrize(("share", "noise", "shown"), [(0.05, 0, True), (0.0, 0, False), (0.0, 4, False)])
+def test_doubles_show_that_leave_a_slow_clock(rng, share, noise, shown):
+    """All stamps but those of the second of doubles are whole milliseconds; spread ticks tell nothing."""
+    t = 1000.0 * rng.integers(0, 20_000, 60_000)
+    pixel = rng.integers(0, 900, len(t))
+    t += np.round(noise * rng.standard_normal(len(t)))
+    again = np.flatnonzero(rng.random(len(t)) < share)
+    gap = np.round(rng.uniform(8, 18, len(again)))
+    t, pixel = np.concatenate([t, t[again] + gap]), np.concatenate([pixel, pixel[again]])
+    order = np.argsort(t, kind="stable")
+    t, pixel = t[order] - t.min(), pixel[order]
+    x, y = (pixel % 30).astype(np.uint16), (pixel // 30).astype(np.uint16)
+    signatures = dase.find_signatures(Events(t * 1e-6, x, y, pixel % 3 > 0, 30, 30))
+    if not noise:
+        assert signatures["time stamps"].found
+    assert signatures["double events"].found == shown
+
+
 @pytest.mark.parametrize("seed", range(4))
 def test_noise_in_step_with_two_tones_is_no_lamp(seed):
     """A hash in place of random numbers gives noise times in common: 310 Hz, and 155 Hz half as strong."""
