@@ -77,7 +77,9 @@ def search_effects(
         if model is not single and not leaves_nothing(judgement):
             # beside a right pair shows what no effect alone did
             model, judgement = _add_one_by_one(state, compared, model, _left_to_add(task, model, most))
-    if len(task.added_to(model)) > 1:
+    added = task.added_to(model)
+    # one alone is needed; whether what it becomes at the end of its range does as well is asked all the same
+    if len(added) > 1 or any(model.sensor[name].simpler() for name in added):
         whole = model
         model, judgement = prune_model(task, state.path, model, judgement)
         if model is not whole and not leaves_nothing(judgement) and not state.path.has_asked(model):

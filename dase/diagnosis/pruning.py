@@ -40,6 +40,10 @@ def prune_model(
             judged = task.judge(swapped)
             without = path.without.get(name)
             if not reaches_floor(judged):
+                near = judged.error <= judgement.error + task.settings.grades.includer_better
+                if near and _does_the_same(task, model, name, rivals[other], judgement):
+                    # what else is missing may only show beside the simple one
+                    return swapped, judged
                 continue
             # at the floor is not enough where chance is far below: dark current at 1.08 for leak at 0.35
             if judged.error > max(LIMITS.quiet, judged.reach, judgement.error + task.settings.tie):
@@ -60,6 +64,24 @@ def prune_model(
                 model, judgement = swapped, judged
                 break
     return _drop_needless(task, path, model, judgement) if model is not before else (model, judgement)
+
+
+def _does_the_same(
+    task: DiagnosisTask, model: FittedModel, name: str, swap: FittedModel, judgement: Judgement
+) -> bool:
+    """Whether an effect does what a simpler one in its place does, before that is fitted.
+
+    Args:
+        task: Effects and settings.
+        model: With the effect.
+        name: Of the effect, as two poles of which one is too fast to be seen.
+        swap: The model with another in its place.
+        judgement: The model's held-out error.
+    """
+    simpler = [one.name for one in model.sensor[name].simpler() if one.name in swap.sensor]
+    if not simpler or len(swap.place) >= len(model.place):
+        return False
+    return task.judge(swap).error <= judgement.error + task.settings.grades.includer_better
 
 
 def _is_no_better_than_a_part_of_it(
@@ -86,7 +108,9 @@ def _is_no_better_than_a_part_of_it(
 def _drop_needless(
     task: DiagnosisTask, path: SearchPath, model: FittedModel, judgement: Judgement
 ) -> tuple[FittedModel, Judgement]:
-    """Drop effects that are not needed any more."""
+    """Drop effects that are not needed any more; one alone is not asked for."""
+    if len(task.added_to(model)) == 1:
+        return model, judgement
     whole = model
     near = max(judgement.gate, judgement.error)
     ways = _keep_near_models(task, _droppable_models(task, model), near)

@@ -132,9 +132,11 @@ def fake(names: str, errors: dict[str, float], monkeypatch, **more) -> tuple:
             return self.replace(name, "")
 
         def __getitem__(self, name: str) -> SimpleNamespace:
-            return SimpleNamespace(longest_step=lambda: steps.get(name, 1.0))
+            less = tuple(SimpleNamespace(name=n) for n in simpler.get(name, ""))
+            return SimpleNamespace(longest_step=lambda: steps.get(name, 1.0), simpler=lambda: less)
 
     steps: dict[str, float] = more.pop("steps", {})
+    simpler: dict[str, str] = more.pop("simpler", {})
     task = SimpleNamespace(
         judge=lambda m: judged(errors[m.names]), added_to=lambda m: tuple(m.names),
         settings=DEFAULTS, evidence=None, seed=0, effects=more.pop("effects", {}),
@@ -228,6 +230,17 @@ def test_what_includes_an_effect_must_do_better_than_it(monkeypatch):
         errors["aZ"] = error
         asked = fake("ab", errors, monkeypatch, rivals={"b": "Z"}, effects=more)
         assert reviewing.prune_model(*asked)[0].names == "aZ"
+
+
+def test_what_does_no_more_than_a_simpler_one_gives_way_above_the_floor(monkeypatch):
+    """Two poles of 130 Hz and 17 kHz came to 0.84 where the pole had 1.0: a dark current was missing."""
+    errors = {"Z": 1.4, "": 9.0, "b": 1.35 + DEFAULTS.grades.includer_better}
+    for simpler, left in (({"Z": "b"}, "b"), ({}, "Z")):
+        asked = fake("Z", errors, monkeypatch, rivals={"Z": "b"}, simpler=simpler)
+        assert reviewing.prune_model(*asked)[0].names == left
+    errors["b"] = 1.45 + DEFAULTS.grades.includer_better  # two poles
+    asked = fake("Z", errors, monkeypatch, rivals={"Z": "b"}, simpler={"Z": "b"})
+    assert reviewing.prune_model(*asked)[0].names == "Z"
 
 
 def test_no_rival_takes_the_place_of_what_a_closer_look_shows(monkeypatch):
