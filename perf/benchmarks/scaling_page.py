@@ -40,16 +40,17 @@ v2e's `clean`, its lin-log response and its spread of thresholds, for the number
 floor below its logarithm, so black pixels send more events.
 
 `video to HDF5` and `video to DAT` are whole jobs, from an AVI (MJPG) to a file of events. On the AMD EPYC,
-clean and noisy, dase is 11.8 and 14.5 times as fast as v2e, both into HDF5, and 149 and 23 times as fast as
+clean and noisy, dase is 11.3 and 16.9 times as fast as v2e, both into HDF5, and 140 and 25 times as fast as
 OpenEB's sample, both into DAT, because that empties its memory, room for 10^8 events, at every 50,000 events.
-With that left out and all events written at the end, dase is 1.8 and 2.8 times as fast as OpenEB. On an Intel
+With that left out and all events written at the end, dase is 1.7 and 2.9 times as fast as OpenEB. On an Intel
 Xeon (family 6, model 167), at 0c92321, others at work: 7 and 15 times v2e (8 and 10 in a second, busier run),
 57 and 25 times OpenEB's sample; with its events at the end OpenEB takes 0.6 times as long as dase for the
 ideal pixel and 1.3 times for the noisy one.
 
-In memory on the AMD EPYC, one run: the ideal pixel from pictures is 4.5 times as fast as OpenEB and 3.5 times
-as the NumPy pipeline (the photograph moved and counted: 1.18 times as the tuned one), the noisy pixel 3.3
-times as OpenEB and 23 times as v2e. At 07707fe it was 5.2, 4.1, 1.25, 3.2 and 23 times, and in two runs
+In memory on the AMD EPYC, one run: the ideal pixel from pictures is 4.9 times as fast as OpenEB and 5.2 times
+as the NumPy pipeline (the photograph moved and counted: 1.31 times as the tuned one), the noisy pixel 5.0
+times as OpenEB, whose rounds were from 29 to 48 (3.4 times the fastest), and 25 times as v2e. At 4d8d46f it
+was 4.5, 3.5, 1.18, 3.3 and 23 times, at 07707fe 5.2, 4.1, 1.25, 3.2 and 23 times, and in two runs
 before that, with other programs about, the noisy pixel was at 2.98 and 3.03 times OpenEB, where 3 is the
 goal, and the ideal one at 3.6 and 4.5.
 
@@ -68,16 +69,19 @@ the present `davis346` takes 35 s at 56c6730 (88,096,752 events; 47 and 45 s at 
 that of 3859195 takes 33 s (163,618,642 events; 59 s at 3859195 in the same run). In a later run, at
 2f4580b, these were 38 and 33 s, and 61 s at 3859195; the first was 36 and 35 s at 12886e8. At fdab943, two
 rounds in turns with 3859195: 34.9 and 33.2 s, and 32.1 and 31.7 s for 63.2 and 58.9 (0.51 and 0.54, the
-same 163,618,642 events). The goal of 25 s is missed. On an H100 with 16 cores of an Intel Xeon, at 12886e8
+same 163,618,642 events). At d30e30f they were 34.2 and 33.9 s for 68.3 and 61.9 (0.50 and 0.55), the present
+`davis346` 39.5 and 38.2 s (a few other programs about). The goal of 25 s is missed. On an H100 with 16 cores of an Intel Xeon, at 12886e8
 and a5feef4, each time with 3859195 in one run, the sensor of 3859195 and the same 163,618,663 events: 15.5
 and 14.5 s with one process for 27.5 and 26.7, 8.3 and 7.7 s with eight for 10.6 and 9.5; the present
 `davis346`, whose bus the processor reads out, 15.3 and 12.7 s, and 9.2 and 8.3 s. At 3bf798f, again with
 3859195 in one run, two rounds: 11.5 and 10.2 s with one process for 32.2 and 27.7, 7.7 and 7.0 s with eight
 for 9.9 and 9.7; the present `davis346` 13.1 and 10.9 s, and 9.6 and 8.8 s. At 5637f1a 10.9 s for 29.4 with
-one process (0.37), 7.3 for 11.7 with eight (0.63), the present `davis346` 13.3 and 9.2 s. To import dase
+one process (0.37), 7.3 for 11.7 with eight (0.63), the present `davis346` 13.3 and 9.2 s. On an H200, at
+d30e30f, 12.2 and 11.8 s with one process and 7.7 and 7.8 with eight (3859195 was not run beside it). To import dase
 and begin with the GPU takes 1.9 s of each. The goals of 6 and 3 s are missed. `dase.simulate` of the noisy
 `davis346` (346x260) alone takes 7.6 times as long there (7.3 to 8.1, 270 ms for 36, 5637f1a; the same at
-3bf798f) as at 3859195, which had no bus; the goal was 1.3. `perf/RESULTS.md` has the stages, and why the
+3bf798f; 7.0 at a8001e3, 254 ms for 37 on an H200, and 0.71 with the sensor of 3859195; 6.8 at d30e30f, 270
+ms for 40) as at 3859195, which had no bus; the goal was 1.3. `perf/RESULTS.md` has the stages, and why the
 bus is no work for a GPU as it is."""
 
 
