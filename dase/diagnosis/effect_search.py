@@ -31,7 +31,7 @@ from dase.diagnosis.ranking import rank_of
 from dase.diagnosis.redrawn_thresholds import EFFECT as JITTER
 from dase.diagnosis.redrawn_thresholds import add_jitter, find_jitter_beside
 from dase.diagnosis.settings import DEFAULTS, DiagnosisSettings
-from dase.diagnosis.state import DiagnosisState, DiagnosisTask, explains_remainder
+from dase.diagnosis.state import DiagnosisState, DiagnosisTask, explains_remainder, with_same_freedom
 from dase.fitting.measurement import Measurement
 from dase.fitting.model import FittedModel, refit_model, with_full_range
 from dase.fitting.scene_doubt import with_scene_doubt
@@ -69,6 +69,8 @@ def search_effects(
         state.other_scene = _through_a_lens(state, compared, model, judgement)
         if state.other_scene is not None:
             return model, judgement
+    if most > 0 and not reaches_floor(judgement):
+        model, judgement = _begin_as_given(state, compared, start, model, judgement, most)
     if not reaches_floor(judgement) and most > 1:
         model, judgement = _go_the_other_way(state, compared, model, judgement, most)
     if not reaches_floor(judgement) and most > 1:
@@ -114,6 +116,69 @@ def _known_at_frames(
     return known_at_frames_alone(
         compared.measurement, evidence, model, judgement.error, compared.split, seed=seed
     )
+
+
+def _begin_as_given(
+    state: DiagnosisState,
+    compared: ComparedMeasurement,
+    start: FittedModel,
+    model: FittedModel,
+    judgement: Judgement,
+    most: int,
+) -> tuple[FittedModel, Judgement]:
+    """Search once more from the values that were given of effects which took what another one makes.
+
+    All that is given is fitted before anything is added. Bandwidth, spread and thresholds then stand in for a
+    lin-log response in part, and from there no descent comes back.
+
+    Args:
+        state: Its path becomes that of this search, where it is the better one.
+        compared: The measurement, and the sensor as it was given.
+        start: What is given, fitted.
+        model: The last one, above the floor.
+        judgement: Its held-out error.
+        most: Effects that are added at most.
+    """
+    task, path, settings = state.task, state.path, state.task.settings
+    near = judgement.error < settings.far * judgement.gate
+    others = {axis.effect.name for axis in start.space.axes} - {"threshold"}
+    if not near or not path.first or others.isdisjoint(e.name for e in compared.given.effects):
+        return model, judgement
+    sensor = start.sensor
+    for effect in compared.given.effects:
+        if effect.name in sensor:
+            sensor = sensor.with_effect(effect)
+    given = with_same_freedom(sensor, start, ())
+    first = task.judge(given, repeats=settings.candidates.few_repeats)
+    if first.error < judgement.error + settings.material:
+        return model, judgement  # what was given has taken nothing
+    far = first.error > settings.far * first.gate
+    present = calibrate_split(
+        task.evidence, given, repeats=settings.scout_repeats if far else settings.repeats,
+        scout_repeats=settings.scout_repeats, seed=task.seed,
+    )  # fmt: skip
+    tried = try_effects(
+        present, given, task.effects, effects_to_try(task.effects, given), worst=worst_families(first),
+        far=far, seed=task.seed, report=lambda text, share: task.progress(text, share, judgement.error),
+        settings=settings.candidates,
+    )  # fmt: skip
+    best, ties = _best_candidate(settings, tried, judgement)
+    if best is None:
+        return model, judgement
+    without = path.models[path.first_step]
+    state.leave_at_first_step()
+    step = path.history[path.first_step]
+    fitted = task.judge(without)
+    ranking = tuple(rank_of(one, fitted) for one in tried)
+    state.add_step(replace(step, ranking=ranking, chosen=best.name, ties=ties))
+    state.note_addition(best, [one for one in tried if one.judgement], fitted)
+    begin = refit_model(task.evidence, best.model, seed=task.seed, rounds=1)
+    found, judged = _add_one_by_one(state, compared, begin, _left_to_add(task, begin, most))
+    gain = 1.0 if reaches_floor(judged) else settings.pair_gain
+    if judged.error < gain * judgement.error:
+        return found, judged
+    state.go_back(path)
+    return model, judgement
 
 
 def _go_the_other_way(

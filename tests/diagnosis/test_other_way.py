@@ -132,3 +132,54 @@ def test_what_was_simulated_before_a_measurement_is_split_anew_counts(state):
     state.split_anew(SimpleNamespace(samples=20, evaluations=3))
     assert (state.samples, state.evaluations) == (1e9 + 30, 105)
     assert state.task.all_time
+
+
+def began_as_given(monkeypatch, state, *, error=1.7, as_given=8.3, base=("bandwidth",)) -> Any:
+    """Return the values that effects were tried beside, and the result, if a lin-log response is missing.
+
+    Fitted, a base of its own leaves `error` and 350 Hz; as it was given, with 460 Hz, `as_given`.
+    """
+    beside = []
+
+    def of_given(model) -> bool:
+        return "bandwidth" in model.sensor and model.sensor["bandwidth"].cutoff > 400
+
+    def try_all(present, model, *rest, **how):
+        beside.append(model.sensor)
+        sensor = model.sensor.with_effect(EFFECTS["linlog"]())
+        found = {**vars(tried("linlog", 0.5)), "model": model_of(sensor), "p_value": 0.03, "includes": ()}
+        return [SimpleNamespace(**found)]
+
+    monkeypatch.setattr(effect_search, "try_effects", try_all)
+    monkeypatch.setattr(effect_search, "calibrate_split", lambda evidence, *given, **how: evidence)
+    monkeypatch.setattr(effect_search, "worst_families", lambda judgement: ())
+    monkeypatch.setattr(effect_search, "rank_of", lambda one, without: SimpleNamespace(fall=1.2, share=1.0))
+    monkeypatch.setattr(
+        DiagnosisTask, "judge", lambda self, model, **how: judged(as_given if of_given(model) else error)
+    )
+    monkeypatch.setattr(
+        effect_search, "_add_one_by_one", lambda state, compared, model, most: (model, judged(0.4))
+    )
+    given, fitted = Sensor(), Sensor()
+    for name in base:
+        given = given.with_effect(EFFECTS[name](**({"cutoff": 460.0} if name == "bandwidth" else {})))
+        fitted = fitted.with_effect(EFFECTS[name](**({"cutoff": 350.0} if name == "bandwidth" else {})))
+    start = model_of(fitted, ["bandwidth.cutoff"] if "bandwidth" in base else None)
+    state.path = SearchPath(history=(step(None, *base),), models=(start,), first=(tried("linlog", 1.6),))
+    state.task = replace(state.task, given=frozenset({"threshold", *base}))
+    compared = SimpleNamespace(given=given)
+    return beside, effect_search._begin_as_given(state, compared, start, start, judged(error), 3)
+
+
+def test_a_search_begins_again_from_what_was_given_of_a_base_that_stands_in(monkeypatch, state):
+    """A low-pass, mismatch and thresholds had taken most of a lin-log response, and it was not found."""
+    beside, (model, judgement) = began_as_given(monkeypatch, state)
+    assert [one["bandwidth"].cutoff for one in beside] == [pytest.approx(460.0)]
+    assert (state.task.added_to(model), judgement.error) == (("linlog",), 0.4)
+    assert [one.chosen for one in state.path.history] == ["linlog"]
+
+
+@pytest.mark.parametrize("how", [{"as_given": 1.8}, {"error": 4.0}, {"base": ()}])
+def test_it_does_not_where_the_base_has_taken_nothing_or_there_is_none(monkeypatch, state, how):
+    before, _ = began_as_given(monkeypatch, state, **how)
+    assert not before
