@@ -31,7 +31,13 @@ from dase.diagnosis.ranking import rank_of
 from dase.diagnosis.redrawn_thresholds import EFFECT as JITTER
 from dase.diagnosis.redrawn_thresholds import add_jitter, find_jitter_beside
 from dase.diagnosis.settings import DEFAULTS, DiagnosisSettings
-from dase.diagnosis.state import DiagnosisState, DiagnosisTask, explains_remainder, with_same_freedom
+from dase.diagnosis.state import (
+    DiagnosisState,
+    DiagnosisTask,
+    SearchPath,
+    explains_remainder,
+    with_same_freedom,
+)
 from dase.fitting.measurement import Measurement
 from dase.fitting.model import FittedModel, refit_model, with_full_range
 from dase.fitting.scene_doubt import with_scene_doubt
@@ -172,13 +178,8 @@ def _begin_as_given(
     ranking = tuple(rank_of(one, fitted) for one in tried)
     state.add_step(replace(step, ranking=ranking, chosen=best.name, ties=ties))
     state.note_addition(best, [one for one in tried if one.judgement], fitted)
-    begin = refit_model(task.evidence, best.model, seed=task.seed, rounds=1)
-    found, judged = _add_one_by_one(state, compared, begin, _left_to_add(task, begin, most))
-    gain = 1.0 if reaches_floor(judged) else settings.pair_gain
-    if judged.error < gain * judgement.error:
-        return found, judged
-    state.go_back(path)
-    return model, judgement
+    found = _search_beside(state, compared, best, most)
+    return _better_way(state, path, (model, judgement), found)
 
 
 def _go_the_other_way(
@@ -212,13 +213,38 @@ def _go_the_other_way(
     state.leave_at_first_step()
     state.add_step(replace(first, chosen=other.name, ties=()))
     state.note_addition(other, [one for one in path.first if one.judgement], task.judge(start))
-    begin = refit_model(task.evidence, other.model, seed=task.seed, rounds=1)
-    found, judged = _add_one_by_one(state, compared, begin, _left_to_add(task, begin, most))
-    gain = 1.0 if reaches_floor(judged) else settings.pair_gain
-    if judged.error < gain * judgement.error:
-        return found, judged
+    found = _search_beside(state, compared, other, most)
+    return _better_way(state, path, (model, judgement), found)
+
+
+def _search_beside(
+    state: DiagnosisState, compared: ComparedMeasurement, first: Candidate, most: int
+) -> tuple[FittedModel, Judgement]:
+    """Return what adding one effect after the other beside a first one comes to, and its held-out error."""
+    task = state.task
+    begin = refit_model(task.evidence, first.model, seed=task.seed, rounds=1)
+    return _add_one_by_one(state, compared, begin, _left_to_add(task, begin, most))
+
+
+def _better_way(
+    state: DiagnosisState,
+    path: SearchPath,
+    before: tuple[FittedModel, Judgement],
+    found: tuple[FittedModel, Judgement],
+) -> tuple[FittedModel, Judgement]:
+    """Return what another way found if that is the better one; else go back.
+
+    Args:
+        state: Has the path of the other way, and gets the first one back.
+        path: Of the first way.
+        before: The last model of the first way, above the floor, and its held-out error.
+        found: The same of the other way.
+    """
+    gain = 1.0 if reaches_floor(found[1]) else state.task.settings.pair_gain
+    if found[1].error < gain * before[1].error:
+        return found
     state.go_back(path)
-    return model, judgement
+    return before
 
 
 def _fit_beyond_the_search(

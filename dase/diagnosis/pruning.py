@@ -21,6 +21,8 @@ def prune_model(
 ) -> tuple[FittedModel, Judgement]:
     """Drop effects that are not needed any more, put simpler ones in place of others, and drop again.
 
+    Above the floor the first that does no more than a simpler one gives way to it, and nothing else is asked.
+
     Args:
         task: What the diagnosis is asked.
         path: What is certain, and what was judged with each effect.
@@ -40,8 +42,8 @@ def prune_model(
             judged = task.judge(swapped)
             without = path.without.get(name)
             if not reaches_floor(judged):
-                near = judged.error <= judgement.error + task.settings.grades.includer_better
-                if near and _does_the_same(task, model, name, rivals[other], judgement):
+                limit = judgement.error + task.settings.grades.includer_better
+                if judged.error <= limit and _does_the_same(task, model, name, rivals[other], limit):
                     # what else is missing may only show beside the simple one
                     return swapped, judged
                 continue
@@ -67,7 +69,7 @@ def prune_model(
 
 
 def _does_the_same(
-    task: DiagnosisTask, model: FittedModel, name: str, swap: FittedModel, judgement: Judgement
+    task: DiagnosisTask, model: FittedModel, name: str, swap: FittedModel, limit: float
 ) -> bool:
     """Whether an effect does what a simpler one in its place does, before that is fitted.
 
@@ -76,12 +78,12 @@ def _does_the_same(
         model: With the effect.
         name: Of the effect, as two poles of which one is too fast to be seen.
         swap: The model with another in its place.
-        judgement: The model's held-out error.
+        limit: Held-out error up to which it does.
     """
     simpler = [one.name for one in model.sensor[name].simpler() if one.name in swap.sensor]
     if not simpler or len(swap.place) >= len(model.place):
         return False
-    return task.judge(swap).error <= judgement.error + task.settings.grades.includer_better
+    return task.judge(swap).error <= limit
 
 
 def _is_no_better_than_a_part_of_it(
