@@ -80,10 +80,10 @@ for 32.2 and 27.7, 7.7 and 7.0 s with eight for 9.9 and 9.7; the present `davis3
 present `davis346` 13.3 and 9.2 s. On an H200, at c6f74ed, 13.2 and 12.8 s for 34.3 with one process
 (0.38), 8.4 and 8.7 for 11.1 and 11.6 with eight (0.75), again in one run; at d30e30f 12.2 and 11.8, 7.7
 and 7.8, at c71d701 11.4 and 8.9, 7.2 and 7.3. To import dase and begin with the GPU takes 1.9 s of each.
-The goals of 6 and 3 s are missed. `dase.simulate` of the noisy `davis346` (346x260) alone takes 7.6 times as long there (7.3 to 8.1, 270 ms for 36, 5637f1a; the same at
-3bf798f; 7.0 at a8001e3, 254 ms for 37 on an H200, and 0.71 with the sensor of 3859195; 6.8 at d30e30f,
-270 ms for 40) as at 3859195, which had no bus; the goal was 1.3. `perf/RESULTS.md` has the stages, and
-why the bus is no work for a GPU as it is."""
+The goals of 6 and 3 s are missed. `dase.simulate` of the noisy `davis346` (346x260) alone takes 7.6 times
+as long there (7.3 to 8.1, 270 ms for 36, 5637f1a; the same at 3bf798f; 7.0 at a8001e3, 254 ms for 37 on
+an H200, and 0.71 with the sensor of 3859195; 6.8 at d30e30f, 270 ms for 40) as at 3859195, which had no
+bus; the goal was 1.3. `perf/RESULTS.md` has the stages, and why the bus is no work for a GPU as it is."""
 
 
 def powers(most: int) -> list[int]:
