@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from dase.learning.scene_batches import Scenery, middle_intensity
+from dase.learning.scene_batches import Scenery
 from dase.learning.targets import Pairs, draw_noise, simulate_counts
 from dase.networks.threshold_network import NetworkShape, ThresholdMaps, ThresholdNet
 
@@ -64,8 +64,9 @@ def _median_event_rate(mu: float, spread: float, scenery: Scenery, scenes: int, 
     rates = []
     for _ in range(0, scenes, 12):
         log = scenery.draw(rng, 12)
-        level = torch.full_like(middle_intensity(log), mu)
-        rates.append(simulate_counts(log, level, spread * mu, draw_noise(log, generator)).mean((1, 2, 3)))
+        noise = draw_noise(log, generator, len(scenery.lead))
+        level = torch.full_like(noise.z, mu)
+        rates.append(simulate_counts(log, level, spread * mu, noise).mean((1, 2, 3)))
     return float(torch.cat(rates).median())
 
 

@@ -10,7 +10,7 @@ from torch.nn import functional as F
 
 from dase.learning.known_physics import KnownPhysics
 from dase.learning.moment_matching import REFERENCE, Moments, MomentSettings, moment_discrepancy
-from dase.learning.scene_batches import Scenery, middle_intensity
+from dase.learning.scene_batches import Scenery, middle_intensity, send_words
 from dase.learning.targets import Pairs, Target, draw_noise, simulate_counts
 from dase.networks.threshold_network import ThresholdMaps, ThresholdNet
 
@@ -28,8 +28,8 @@ class MapEvaluation:
     def __init__(self, scenery: Scenery, target: Target, *, scenes: int = 16, seed: int = 12345):
         rng, generator = np.random.default_rng(seed), torch.Generator(scenery.device).manual_seed(seed)
         self.log = scenery.draw(rng, scenes)
-        self.grey = middle_intensity(self.log)
-        self.noise = draw_noise(self.log, generator)
+        self.grey = middle_intensity(self.log, len(scenery.lead))
+        self.noise = draw_noise(self.log, generator, len(scenery.lead))
         self.truth = None if target.truth is None else target.truth(self.grey)
         mu, sigma = self.truth or (torch.full_like(self.grey, 0.2), 0.05)
         self.active = simulate_counts(self.log, mu, sigma, self.noise).sum(1) > 0
@@ -128,14 +128,16 @@ class HeldOutScore:
             self.physics.generator.manual_seed(self.seed)
         out = []
         for _ in range(0, self.scenes, self.batch):
-            log = self.scenery.draw(rng, self.batch)
-            grey = middle_intensity(log)
-            noise = draw_noise(log, generator)
+            numbers = send_words(self.scenery.draw_numbers(rng, self.batch), self.scenery.device)
+            log = self.scenery.render(numbers, self.batch)
+            grey = middle_intensity(log, len(self.scenery.lead))
+            noise = draw_noise(log, generator, len(self.scenery.lead))
             if net is None:
                 level = torch.full_like(grey, REFERENCE[0])
                 out.append(Pairs(grey, simulate_counts(log, level, REFERENCE[1], noise)))
             elif self.physics is not None:
-                out.append(Pairs(grey, self.physics.count(log, net(grey))))
+                known = self.scenery.known(numbers, self.batch)
+                out.append(Pairs(grey, self.physics.count(log, net(grey), known)))
             else:
                 out.append(Pairs(grey, simulate_counts(log, *net(grey).by_polarity(), noise)))
         return out

@@ -27,7 +27,7 @@ from dase.learning.random_streams import TrainingDraw, TrainingStream
 from dase.learning.recipe import Recipe
 from dase.learning.recorded_target import ReplayedScenes, open_target
 from dase.learning.run import RunFile
-from dase.learning.scene_batches import Scenery, SceneSettings, middle_intensity
+from dase.learning.scene_batches import Scenery, SceneSettings, middle_intensity, send_words
 from dase.learning.targets import FiniteTarget, Target, Truth, draw_noise, simulate_counts, store_pairs
 from dase.learning.training import Objective, Training, make_network
 from dase.networks.threshold_network import NetworkShape, ThresholdNet
@@ -237,7 +237,7 @@ def compose_training(
     if sensor is not None:
         # processes differ as their scenes do
         physics = KnownPhysics(
-            sensor, scenery.scene_settings, batch=recipe.batch, device=scenery.device,
+            sensor, scenery.scene_settings, lead=scenery.lead, batch=recipe.batch, device=scenery.device,
             seed=TrainingStream.KNOWN_PHYSICS.seed(recipe.seed, distributed.process_rank()),
         )  # fmt: skip
     net = make_network(recipe, scenery.device)
@@ -397,15 +397,18 @@ def write_examples(out: Path, training: Training, *, scenes: int = 3, seed: int 
         busy = training.target.recorded.counts.float().sum((1, 2, 3))
         index = torch.sort(torch.topk(busy, min(4 * scenes, len(busy))).indices).values
         index = index[:: max(len(index) // scenes, 1)][:scenes]
-        log, real = scenery.log[index].float(), training.target.recorded.select(index)
+        numbers, real = index.int(), training.target.recorded.select(index)
     else:
-        log, real = scenery.draw(rng, scenes), training.target.draw(rng, scenes)
-    grey = middle_intensity(log)
+        numbers = send_words(scenery.draw_numbers(rng, scenes), scenery.device)
+        real = training.target.draw(rng, scenes)
+    log, lead = scenery.render(numbers, scenes), len(scenery.lead)
+    grey = middle_intensity(log, lead)
     maps = net(grey)
     mu, sigma = maps.by_polarity()
-    counts = simulate_counts(log, mu, sigma, draw_noise(log, generator))
+    counts = simulate_counts(log, mu, sigma, draw_noise(log, generator, lead))
     if training.physics is not None:
-        counts = training.physics.with_batch(len(log), seed).count(log, maps)
+        known = scenery.known(numbers, scenes)
+        counts = training.physics.with_batch(len(log), seed).count(log, maps, known)
     arrays = dict(
         grey=grey, real_grey=real.grey, real=real.counts, simulated=counts, mu=maps.mu, sigma=maps.sigma
     )

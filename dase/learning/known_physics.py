@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 import warp as wp
+from numpy.typing import NDArray
 
 from dase.effects.learned_threshold import LearnedThreshold
 from dase.effects.optics import SceneEffect
@@ -44,6 +45,7 @@ class KnownPhysics:
     Args:
         sensor: Its thresholds and mismatch do not count.
         scenes: What scenes look like.
+        lead: Times of the samples that lead up to a window, see `Scenery.lead`; None for none.
         batch: Scenes B that are counted at once.
         device: PyTorch device.
         seed: Of the pixels' noise.
@@ -54,7 +56,14 @@ class KnownPhysics:
     """
 
     def __init__(
-        self, sensor: Sensor, scenes: SceneSettings, *, batch: int, device: torch.device, seed: int = 0
+        self,
+        sensor: Sensor,
+        scenes: SceneSettings,
+        *,
+        lead: NDArray[np.float64] | None = None,
+        batch: int,
+        device: torch.device,
+        seed: int = 0,
     ):
         optics = [e.name for e in sensor.effects if isinstance(e, SceneEffect) and not e.is_off()]
         self.left_out = (*optics, *(effect.name for effect in sensor.readout_effects()))
@@ -64,6 +73,7 @@ class KnownPhysics:
             )
         self.given, self.sensor = sensor, with_learned_thresholds(sensor, on=0.2, off=0.2)
         self.scenes, self.batch, self.device = scenes, batch, device
+        self.lead = np.empty(0) if lead is None else lead
         self.generator = torch.Generator(device).manual_seed(seed)
         self._where = launch.find_device(str(device))
         names, count = self.sensor.parameter_names(), scenes.width * scenes.height
@@ -81,26 +91,37 @@ class KnownPhysics:
         self._parameters = row.contiguous()
         places = np.repeat(np.arange(count, dtype=np.int32)[None], batch, 0)
         self._places = torch.from_numpy(places).to(device)
-        self._light = torch.ones(batch, scenes.samples, device=device)
-        self._times = np.linspace(0.0, scenes.window, scenes.samples)
-        self._clock = self._pixels.clock(self._times, np.array([0, scenes.samples], np.int32))
+        times = np.concatenate([self.lead, np.linspace(0.0, scenes.window, scenes.samples)])
+        # what comes between the last sample of the lead and the begin of the window is of the lead
+        self._times = np.split(times - times[0], [len(self.lead) + 1]) if len(self.lead) else [times]
+        self._clocks = []
+        for part in self._times:
+            # of samples that follow those of the part before
+            self._clocks.append(self._pixels.clock(part, np.array([0, len(part)], np.int32)))
+            self._pixels.samples, self._pixels.begin = self._pixels.samples + len(part), float(part[-1])
 
     def with_batch(self, batch: int, seed: int) -> KnownPhysics:
         """Return the same for another number of scenes, with random numbers of its own."""
-        return KnownPhysics(self.given, self.scenes, batch=batch, device=self.device, seed=seed)
+        return KnownPhysics(
+            self.given, self.scenes, lead=self.lead, batch=batch, device=self.device, seed=seed
+        )
 
     @torch.no_grad()
-    def count(self, log: torch.Tensor, maps: ThresholdMaps) -> torch.Tensor:
+    def count(
+        self, log: torch.Tensor, maps: ThresholdMaps, known: torch.Tensor | None = None
+    ) -> torch.Tensor:
         """Return counts of the whole window, shape (B, 2, H, W), OFF before ON, without a gradient.
 
         Args:
-            log: Log intensities of scenes, shape (B, K, H, W).
+            log: Log intensities of scenes, shape (B, L + K, H, W); L samples lead up to the window.
             maps: Distributions of their thresholds; every call draws pixels anew.
+            known: Pixels that count, shape (B, H, W); the others have no events, not even noise. None: all.
         """
         batch, samples = log.shape[:2]
-        if (batch, samples) != (self.batch, self.scenes.samples):
+        expected = sum(map(len, self._times))
+        if (batch, samples) != (self.batch, expected):
             raise ValueError(
-                f"log must be {self.batch} scenes of {self.scenes.samples} samples, got {batch} of {samples}"
+                f"log must be {self.batch} scenes of {expected} samples, got {batch} of {samples}"
             )
         # thresholds are these levels times a factor of the pixel: their mean, and how far a pixel is from it
         middle = maps.mu.log().mean().exp()
@@ -111,16 +132,21 @@ class KnownPhysics:
         seeds = torch.randint(1 << 31, (batch,), generator=self.generator, device=self.device)
         light = (log.float().exp() - LOG_EPS).flatten(2).contiguous()
         frames = torch.empty(1, batch, light.shape[2], device=self.device)
-        grids = torch.zeros(1, batch, 2, light.shape[2], device=self.device)
         with follow_torch_stream(self.device):
-            seen = StoredScenes()
-            seen.values = lend_tensor(light, dtype=wp.float32)
-            seen.light = lend_tensor(self._light, dtype=wp.float32)
             self._pixels.reset(
                 lend_tensor(self._places, dtype=wp.int32), lend_tensor(parameters, dtype=wp.float32),
                 lend_tensor(seeds.int(), dtype=wp.int32), lend_tensor(factors, dtype=wp.float32),
             )  # fmt: skip
-            self._pixels.advance(
-                "frames", seen, self._clock, self._times, lend_tensor(frames), lend_tensor(grids), 1
-            )
-        return grids[0].view(batch, 2, *log.shape[2:])
+            begin = 0
+            for times, clock in zip(self._times, self._clocks, strict=True):
+                end = begin + len(times)
+                part = light[:, begin:end].contiguous()
+                lamps = torch.ones(batch, len(times), device=self.device)
+                grids = torch.zeros(1, batch, 2, light.shape[2], device=self.device)
+                seen = StoredScenes()
+                seen.values = lend_tensor(part, dtype=wp.float32)
+                seen.light = lend_tensor(lamps, dtype=wp.float32)
+                self._pixels.advance("frames", seen, clock, times, lend_tensor(frames), lend_tensor(grids), 1)
+                begin = end
+        counts = grids[0].view(batch, 2, *log.shape[2:])  # the window's: what led up to it does not count
+        return counts if known is None else torch.where(known[:, None], counts, 0.0)

@@ -88,7 +88,7 @@ class MomentObjective:
             reference = simulate_counts(log, level, REFERENCE[1], noise)
         varied = vary_thresholds(log, mu, sigma, noise) if self.trains_network else None
         some = self.choose_derived_scenes(len(log), step, log.device)
-        few = PixelNoise(noise.z[some], noise.phase[some])
+        few = replace(noise, z=noise.z[some], phase=noise.phase[some])
         answers = vary_parameters(log[some], mu.detach()[some], sigma.detach()[some], few)
         return replace(fake, reference=reference, varied=varied, answers=answers, some=some)
 

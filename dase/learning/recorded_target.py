@@ -3,6 +3,11 @@
 The recording is cut into windows. What the camera saw in each, `CameraScene` tells from its frames; the
 simulator is shown the same windows, in other order and with other noise, so that the two sides have the same
 scenes and speeds without being paired. Pixels whose scene cannot be trusted have no events on either side.
+
+A camera's pixels come to a window with what they have seen before it: after a turn of the motion they must go
+through both thresholds, and a slow photoreceptor lags. Simulated pixels that begin with the window have no
+such past, and make up to a third more or less events in 50 ms. So the simulator also sees what leads up to a
+window.
 """
 
 from __future__ import annotations
@@ -30,15 +35,33 @@ class RecordedWindows:
 
     Args:
         begin: Begin of each window [s], shape (M,).
-        log: Log intensities, float16, shape (M, K, H, W); constant where the scene is not trusted.
+        lead: Times of the samples that lead up to a window, from its begin [s], shape (L,).
+        log: Log intensities, float16, shape (M, L + K, H, W); constant where the scene is not trusted.
         counts: Events, float32, shape (M, 2, H, W), OFF before ON; none where the scene is not trusted.
-        trusted: Share of the pixels whose scene is trusted.
+        known: Where the scene is trusted, shape (M, H, W).
     """
 
     begin: NDArray[np.float64]
+    lead: NDArray[np.float64]
     log: NDArray[np.float16]
     counts: NDArray[np.float32]
-    trusted: float
+    known: NDArray[np.bool_]
+
+    @property
+    def trusted(self) -> float:
+        """Share of the pixels whose scene is trusted."""
+        return float(self.known.mean())
+
+    @property
+    def grey(self) -> NDArray[np.float32]:
+        """Intensity at the middles of the windows, shape (M, H, W)."""
+        lead = len(self.lead)
+        middle = self.log[:, lead + (self.log.shape[1] - lead) // 2]
+        return np.exp(middle.astype(np.float32)) - np.float32(LOG_EPS)
+
+
+LEAD = 4
+"""How much of a recording leads up to a window, in windows: 4, with as many samples as the window has."""
 
 
 def cut_windows(
@@ -57,7 +80,7 @@ def cut_windows(
     Args:
         recording: With frames whose times are known.
         window: Duration [s].
-        samples: Of the log intensity, in a window.
+        samples: Of the log intensity, in a window, and in what leads up to it.
         tolerance: Doubt up to which a scene is trusted [log intensity].
         most: Windows, evenly chosen; None for as many as fit into `memory`.
         memory: For the windows' log intensities [bytes]; of a longer recording only some windows are used.
@@ -74,19 +97,22 @@ def cut_windows(
             f"the frames of the recording span {scene.duration:g} s; 4 windows of {window:g} s need "
             f"{4 * window:g} s"
         )
-    size = 2 * samples * recording.height * recording.width
+    lead = -LEAD * window * np.linspace(1, 0, samples, endpoint=False)
+    size = 4 * samples * recording.height * recording.width
     most = min(most or len(begin), max(memory // size, 4))
     begin = begin[np.unique(np.round(np.linspace(0, len(begin) - 1, min(most, len(begin)))).astype(int))]
-    log = np.empty((len(begin), samples, recording.height, recording.width), np.float16)
+    log = np.empty((len(begin), 2 * samples, recording.height, recording.width), np.float16)
     counts = np.empty((len(begin), 2, recording.height, recording.width), np.float32)
-    kept = 0.0
+    known = np.empty((len(begin), recording.height, recording.width), np.bool_)
     for n, start in enumerate(begin):
         times = start + window * np.linspace(0, 1, samples)
         trusted = recording.mask & (scene.doubt(times[:: max(samples // 4, 1)]).max(0) <= tolerance)
-        levels = np.log(scene.frames(times) + np.float32(LOG_EPS))
-        log[n] = np.where(trusted, levels, levels[samples // 2])
+        # before its first frame the scene stands still
+        before = np.maximum(start + lead, scene.times[0])
+        levels = np.log(scene.frames(np.concatenate([before, times])) + np.float32(LOG_EPS))
+        log[n] = np.where(trusted, levels, levels[samples + samples // 2])
         counts[n] = np.where(trusted, _count_events(recording, start, start + window), 0)
-        kept += float(trusted.mean()) / len(begin)
+        known[n] = trusted
         progress(n + 1, len(begin))
     rate = float(counts.sum((1, 2, 3)).mean()) / (recording.height * recording.width)
     if rate < fewest:
@@ -94,7 +120,7 @@ def cut_windows(
             f"the recording has {rate:.2g} events per pixel in windows of {window:g} s where its frames can "
             f"be trusted; learning needs at least {fewest:g}"
         )
-    return RecordedWindows(begin, log, counts, kept)
+    return RecordedWindows(begin, lead, log, counts, known)
 
 
 def _scene_of(recording: Recording) -> CameraScene:
@@ -131,9 +157,13 @@ class ReplayedScenes(Scenery):
 
     def __init__(self, windows: RecordedWindows, *, window: float, device: str | torch.device = "cpu"):
         samples, height, width = windows.log.shape[1:]
-        self.scene_settings = SceneSettings(width=width, height=height, window=window, samples=samples)
+        self.lead = windows.lead
+        self.scene_settings = SceneSettings(
+            width=width, height=height, window=window, samples=samples - len(self.lead)
+        )
         self.device = torch.device(device)
         self.log = torch.from_numpy(windows.log).to(self.device)
+        self.trusted = torch.from_numpy(windows.known).to(self.device)
 
     def draw_numbers(self, rng: np.random.Generator, count: int) -> NDArray[np.int32]:
         """Choose `count` windows; return their indices, (count,)."""
@@ -141,8 +171,12 @@ class ReplayedScenes(Scenery):
         return np.asarray(index, np.int32)
 
     def render(self, numbers: torch.Tensor, count: int) -> torch.Tensor:
-        """Return the log intensities of windows, shape (count, samples, height, width)."""
+        """Return the log intensities of windows, shape (count, L + samples, height, width)."""
         return self.log[numbers[:count].long()].float()
+
+    def known(self, numbers: torch.Tensor, count: int) -> torch.Tensor | None:
+        """Return where the scenes of windows are trusted, shape (count, height, width)."""
+        return self.trusted[numbers[:count].long()]
 
 
 def open_target(
@@ -222,12 +256,11 @@ def join_windows(
         start += len(part.begin)
     # scenes and pairs in one order, so that a window can be looked at from both sides
     chosen = np.array(order + rest)
-    log = np.concatenate([part.log for part in found])[chosen]
-    counts = np.concatenate([part.counts for part in found])[chosen]
-    begin = np.concatenate([part.begin for part in found])[chosen]
-    trusted = float(np.mean([part.trusted for part in found]))
-    every = RecordedWindows(begin, log, counts, trusted)
+    begin, log, counts, known = (
+        np.concatenate(parts)[chosen]
+        for parts in zip(*((part.begin, part.log, part.counts, part.known) for part in found), strict=True)
+    )
+    every = RecordedWindows(begin, found[0].lead, log, counts, known)
     scenes = ReplayedScenes(every, window=window, device=device)
-    middle = np.exp(log[:, log.shape[1] // 2].astype(np.float32)) - np.float32(LOG_EPS)
-    pairs = store_pairs(torch.from_numpy(middle), torch.from_numpy(counts), device)
+    pairs = store_pairs(torch.from_numpy(every.grey), torch.from_numpy(counts), device)
     return FiniteTarget(pairs, held_out=len(rest) / start, augment=False), scenes

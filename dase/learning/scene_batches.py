@@ -35,7 +35,13 @@ class Scenery:
         seed: Draws the pool.
         backgrounds: Textures in the pool for backgrounds.
         objects: Textures in the pool for things in front.
+
+    Attributes:
+        lead: Times of the samples that lead up to a window, from its begin [s], below 0, shape (L,); events
+            in them do not count. Scenes of textures have none: nothing was there before.
     """
+
+    lead: NDArray[np.float64] = np.empty(0)
 
     def __init__(
         self,
@@ -88,7 +94,7 @@ class Scenery:
         return first, second
 
     def draw(self, rng: np.random.Generator, count: int) -> torch.Tensor:
-        """Return log intensities of `count` random scenes, shape (count, samples, height, width)."""
+        """Return log intensities of `count` random scenes, shape (count, L + samples, height, width)."""
         return self.render(send_words(self.draw_numbers(rng, count), self.device), count)
 
     def draw_numbers(self, rng: np.random.Generator, count: int) -> NDArray[np.int32]:
@@ -105,7 +111,7 @@ class Scenery:
         return pack_words(ground, self.start[which], size, place, box)
 
     def render(self, numbers: torch.Tensor, count: int) -> torch.Tensor:
-        """Return log intensities (count, samples, height, width) of what `numbers` drew, on the device."""
+        """Return log intensities of what `numbers` drew, shape (count, L + samples, height, width)."""
         looks, layers = self.scene_settings, most_layers(self.scene_settings)
         pair = (count, layers)
         shapes = (count,), pair, (*pair, 2), (count, looks.samples, layers, 2, 3), (*pair, 4)
@@ -114,6 +120,10 @@ class Scenery:
             self.grey, self.texels, ground, start, size, place.view(torch.float32), box.view(torch.float32),
             width=looks.width, height=looks.height, eps=LOG_EPS,
         )  # fmt: skip
+
+    def known(self, numbers: torch.Tensor, count: int) -> torch.Tensor | None:
+        """Return which pixels' scenes are known, shape (count, height, width); None for all."""
+        return None
 
 
 def pack_words(*arrays: NDArray[Any]) -> NDArray[np.int32]:
@@ -154,6 +164,11 @@ def send_words(
     return here.to(device, non_blocking=True) if to is None else to.copy_(here, non_blocking=True)
 
 
-def middle_intensity(log: torch.Tensor) -> torch.Tensor:
-    """Return the intensity at the middle sample of log intensities (B, K, H, W), shape (B, H, W)."""
-    return torch.exp(log[:, log.shape[1] // 2]) - LOG_EPS
+def middle_intensity(log: torch.Tensor, lead: int = 0) -> torch.Tensor:
+    """Return the intensity at the middle sample of windows, shape (B, H, W).
+
+    Args:
+        log: Log intensities, shape (B, lead + K, H, W).
+        lead: Samples that lead up to the windows.
+    """
+    return torch.exp(log[:, lead + (log.shape[1] - lead) // 2]) - LOG_EPS

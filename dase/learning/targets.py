@@ -251,13 +251,20 @@ class PixelNoise:
     Args:
         z: Normal numbers, one for both thresholds of a pixel, which go together, shape (B, H, W).
         phase: Where between two events a pixel begins, in (-1, 1), shape (B, H, W).
+        lead: Samples before the window, in which pixels get to where its begin finds them; their events do
+            not count.
     """
 
     z: torch.Tensor
     phase: torch.Tensor
+    lead: int = 0
+
+    def windows(self, samples: int) -> tuple[int, ...] | None:
+        """Return for `count_events` that the intervals of `samples` which end the lead do not count."""
+        return (0,) * self.lead + (1,) * (samples - 1 - self.lead) if self.lead else None
 
 
-def draw_noise(log: torch.Tensor, generator: torch.Generator) -> PixelNoise:
+def draw_noise(log: torch.Tensor, generator: torch.Generator, lead: int = 0) -> PixelNoise:
     """Draw the noise of pixels that start anywhere between two events.
 
     As if the first change had been going on before, like `effects.threshold.phase`.
@@ -265,11 +272,12 @@ def draw_noise(log: torch.Tensor, generator: torch.Generator) -> PixelNoise:
     Args:
         log: Log intensities, shape (B, K, H, W).
         generator: Draws the numbers.
+        lead: See `PixelNoise`.
     """
     shape = (len(log), *log.shape[2:])
     z = torch.randn(shape, device=log.device, generator=generator)
     fraction = torch.rand(shape, device=log.device, generator=generator)
-    return PixelNoise(z, torch.where(log[:, 1] >= log[:, 0], fraction, -fraction))
+    return PixelNoise(z, torch.where(log[:, 1] >= log[:, 0], fraction, -fraction), lead)
 
 
 def simulate_counts(
@@ -292,15 +300,16 @@ def simulate_counts(
     Returns:
         Counts of the whole window, shape (B, 2, H, W), OFF before ON.
     """
-    counts = count_events(log, mu, sigma, noise.z, phase=noise.phase, surrogate=surrogate)
-    return counts[:, 0]
+    windows = noise.windows(log.shape[1])
+    counts = count_events(log, mu, sigma, noise.z, phase=noise.phase, windows=windows, surrogate=surrogate)
+    return counts[:, -1]
 
 
 def vary_thresholds(
     log: torch.Tensor, mu: torch.Tensor, sigma: torch.Tensor, noise: PixelNoise
 ) -> VariedCounts:
     """Return how the counts of `simulate_counts`, for arguments of that shape, answer to the thresholds."""
-    theta = clipped_thresholds(mu, sigma, noise.z, like=log)
+    theta, windows = clipped_thresholds(mu, sigma, noise.z, like=log), noise.windows(log.shape[1])
     above: list[torch.Tensor] = []
     below: list[torch.Tensor] = []
     with torch.no_grad():
@@ -309,7 +318,8 @@ def vary_thresholds(
                 moved = theta.detach().clone()
                 moved[:, n] *= factor
                 moved = moved[:, 0] if theta.shape[1] == 1 else moved
-                kept.append(count_events(log, moved, 0.0, 0.0, phase=noise.phase)[:, 0])
+                counts = count_events(log, moved, 0.0, 0.0, phase=noise.phase, windows=windows)
+                kept.append(counts[:, -1])
     return VariedCounts(theta.log(), above, below)
 
 

@@ -254,8 +254,9 @@ class Training:
         sets = []
         for _ in range(batches):
             with torch.no_grad():
-                log = self.scenery.draw(self.scenes, self.recipe.batch)
-                sets.append((self.simulate_fake(log)[0], self.target.draw(self.reals, self.recipe.batch)))
+                numbers = self.scenery.draw_numbers(self.scenes, self.recipe.batch)
+                fake, _ = self.simulate_fake(send_words(numbers, self.device))
+                sets.append((fake, self.target.draw(self.reals, self.recipe.batch)))
         self.objective.calibrate(sets, self._held_out_batches())
         self.calibrated = True
 
@@ -302,7 +303,7 @@ class Training:
         numbers, step, scenes, reals = unpack_words(inputs, *self.shapes)
         numbers = numbers.view(torch.float32)
         share, learn, rates = numbers[0], numbers[1], numbers[2:]
-        fake, maps = self.simulate_fake(self.scenery.render(scenes, recipe.batch), step)
+        fake, maps = self.simulate_fake(scenes, step)
         real = self.target.pairs(reals, recipe.batch)
         loss, values = self.objective.loss(fake, real, move=move, rates=rates)
         if move:
@@ -321,16 +322,21 @@ class Training:
             self._average_weights(learn)
         return values | {"loss": loss.detach()}
 
-    def simulate_fake(self, log: torch.Tensor, step: torch.Tensor | int = 0) -> tuple[Pairs, ThresholdMaps]:
-        """Return pairs simulated from log intensities (B, K, H, W), and the maps of their thresholds."""
-        grey = middle_intensity(log)
+    def simulate_fake(
+        self, numbers: torch.Tensor, step: torch.Tensor | int = 0
+    ) -> tuple[Pairs, ThresholdMaps]:
+        """Return pairs simulated from the scenes that `numbers` (words,) drew, and their thresholds' maps."""
+        batch, lead = self.recipe.batch, len(self.scenery.lead)
+        log = self.scenery.render(numbers, batch)
+        grey = middle_intensity(log, lead)
         maps = self.net(grey)
         mu, sigma = maps.by_polarity() if self.recipe.network.split else (maps.mu, maps.sigma)
-        noise = draw_noise(log, self.generator)
+        noise = draw_noise(log, self.generator, lead)
         counts = simulate_counts(log, mu, sigma, noise, surrogate=self.recipe.surrogate)
         if self.physics is not None:
             # what all effects make of the scenes; how thresholds move counts is told by thresholds alone
-            counts = counts + (self.physics.count(log, maps) - counts).detach()
+            told = self.physics.count(log, maps, self.scenery.known(numbers, batch))
+            counts = counts + (told - counts).detach()
         return self.objective.extend_fake(Pairs(grey, counts), log, mu, sigma, noise, step), maps
 
     @torch.no_grad()

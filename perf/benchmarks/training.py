@@ -173,8 +173,13 @@ def iterations(training: Training, clock: Clock) -> dict[str, float]:
     return out
 
 
+def _scenes(training: Training) -> torch.Tensor:
+    """Return words that draw the scenes of a step."""
+    return send_words(training.scenery.draw_numbers(training.scenes, training.recipe.batch), training.device)
+
+
 def _moments(training: Training, clock: Clock) -> dict[str, float]:
-    fake, _ = training.simulate_fake(training.scenery.draw(training.scenes, training.recipe.batch))
+    fake, _ = training.simulate_fake(_scenes(training))
     real = training.target.draw(training.reals, training.recipe.batch)
     objective = training.objective
     assert isinstance(objective, MomentObjective)
@@ -190,7 +195,7 @@ def _moments(training: Training, clock: Clock) -> dict[str, float]:
 def _critics(training: Training, clock: Clock) -> dict[str, float]:
     objective = training.objective
     assert isinstance(objective, AdversarialObjective)
-    fake, _ = training.simulate_fake(training.scenery.draw(training.scenes, training.recipe.batch))
+    fake, _ = training.simulate_fake(_scenes(training))
     fake = Pairs(fake.grey, fake.counts.detach())
     real = training.target.draw(training.reals, training.recipe.batch)
     size = objective.hasher.how.size

@@ -31,5 +31,5 @@ def a_run(scenes: scene_batches.Scenery, **changes) -> Training:
 
 
 def a_fake(training):
-    log = training.scenery.draw(training.scenes, training.recipe.batch)
-    return training.simulate_fake(log, training.step)[0]
+    numbers = training.scenery.draw_numbers(training.scenes, training.recipe.batch)
+    return training.simulate_fake(scene_batches.send_words(numbers, training.device), training.step)[0]

@@ -56,6 +56,31 @@ def test_counts_are_those_of_the_sensor(scenes):
         assert want.sum() > 100
 
 
+def test_what_leads_up_to_a_window_counts_no_events_but_leaves_its_traces(scenes):
+    """As `dase` counts the last three of six samples of pixels that have seen the first three."""
+    still = SLOW.without("mismatch").with_effect(EFFECTS["threshold"](**THRESHOLD, phase=0.0))
+    whole = scenes.scene_settings
+    times = np.linspace(0, whole.window, whole.samples)
+    looks = replace(whole, samples=3, window=times[-1] - times[3])
+    lead = times[:3] - times[3]
+    physics = KnownPhysics(still, looks, lead=lead, batch=2, device=torch.device("cpu"))
+    log = scenes.draw(np.random.default_rng(1), 2)
+    maps = maps_of(middle_intensity(log, 3), 1e-9)
+    known = torch.ones(2, *log.shape[2:], dtype=torch.bool)
+    known[:, :20] = False
+    got = physics.with_batch(2, 1).count(log, maps, known).numpy()
+    assert not got[:, :, :20].any()
+    for n in range(2):
+        frames = torch.exp(log[n]).numpy() - np.float32(LOG_EPS)
+        scene = VideoScene(np.clip(frames, 0, 1), times)
+        scene.sample_times = lambda: times
+        want = count(scene, still, (times[3], whole.window))[0, 0].reshape(got[n].shape)[:, 20:]
+        assert np.mean(got[n][:, 20:] != want) < 5e-3
+        assert want.sum() > 50
+    alone = KnownPhysics(still, looks, batch=2, device=torch.device("cpu"))
+    assert alone.count(log[:, 3:], maps, known).sum() < 0.9 * got.sum()  # as if all had stood still before
+
+
 def test_pixels_differ_as_the_maps_say(scenes):
     physics = KnownPhysics(SLOW, scenes.scene_settings, batch=4, device=torch.device("cpu"))
     log = scenes.draw(np.random.default_rng(2), 4)

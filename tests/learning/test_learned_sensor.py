@@ -20,6 +20,7 @@ from dase.effects.threshold import Threshold
 from dase.events import Events
 from dase.io.sequence import Sequence
 from dase.learning.recorded_target import cut_windows, open_target
+from dase.learning.targets import draw_noise, simulate_counts
 from dase.networks.threshold_network import NetworkShape, ThresholdNet
 from dase.recordings.recording import Recording
 from dase.scenes.video import VideoScene
@@ -208,9 +209,12 @@ def test_windows_hold_the_scene_and_the_events():
     sequence = moving()
     recording = Recording.of(sequence)
     windows = cut_windows(recording, window=0.1, samples=5)
-    assert windows.log.shape == (len(windows.begin), 5, 32, 32)
+    # as many samples lead up to a window as it has
+    assert windows.log.shape == (len(windows.begin), 10, 32, 32)
+    np.testing.assert_allclose(windows.lead, [-0.4, -0.32, -0.24, -0.16, -0.08])
     assert windows.trusted > 0.5
-    trusted = np.ptp(windows.log, axis=1) > 0
+    trusted = windows.known
+    assert np.all(np.ptp(windows.log, axis=1)[~trusted] == 0)
     t = sequence.events.t
     for n, begin in enumerate(windows.begin):
         some = sequence.events.select((t >= begin) & (t < begin + 0.1))
@@ -218,9 +222,44 @@ def test_windows_hold_the_scene_and_the_events():
         np.testing.assert_array_equal(windows.counts[n][:, trusted[n]], want[:, trusted[n]])
         # untrusted places are still, on both sides
         assert windows.counts[n][:, ~trusted[n]].sum() <= want[:, ~trusted[n]].sum()
-    middle = np.exp(windows.log[0, 2].astype(np.float32)) - 1e-3
+    middle = windows.grey[0]
     at = int(round((windows.begin[0] + 0.05) / 0.02))
     np.testing.assert_allclose(middle, sequence.frames[at] / 255, atol=0.1)
+
+
+def swinging(threshold: float) -> Recording:
+    """Return a texture that swings by a few pixels, twice a second."""
+    rng = np.random.default_rng(2)
+    texture = rng.random((32, 64))
+    for _ in range(2):
+        texture = 0.25 * (np.roll(texture, 1, 1) + np.roll(texture, -1, 1)) + 0.5 * texture
+    texture = 0.1 + 0.8 * (texture - texture.min()) / np.ptp(texture)
+    times = np.arange(0, 4.0, 0.01)
+    columns = np.arange(32)
+    frames = []
+    for t in times:
+        place = columns + 12 + 3 * np.sin(4 * np.pi * t)
+        whole = place.astype(int)
+        share = place - whole
+        frames.append((1 - share) * texture[:, whole] + share * texture[:, whole + 1])
+    stack = np.stack(frames).astype(np.float32)
+    sensor = dase.Sensor((Threshold(on=threshold, off=threshold, phase=1.0),))
+    events = dase.simulate(VideoScene(stack, times), sensor)
+    return Recording.of(Sequence(events, np.round(255 * stack).astype(np.uint8), times))
+
+
+def test_pixels_come_to_a_window_with_what_they_saw_before():
+    """A window that begins with pixels anywhere between their thresholds has more events than a camera's."""
+    threshold = 0.3
+    windows = cut_windows(swinging(threshold), window=0.05, samples=8)
+    log = torch.from_numpy(windows.log.astype(np.float32))
+    noise = draw_noise(log, torch.Generator().manual_seed(3), len(windows.lead))
+    mu = torch.full_like(noise.z, threshold)
+    found = simulate_counts(log, mu, 0.0, noise).sum().item() / windows.counts.sum()
+    assert abs(found - 1) < 0.04
+    window = log[:, len(windows.lead) :]
+    alone = simulate_counts(window, mu, 0.0, draw_noise(window, torch.Generator().manual_seed(3)))
+    assert alone.sum().item() / windows.counts.sum() > 1.15
 
 
 def written(path: Path, sequence: Sequence) -> Path:

@@ -39,7 +39,7 @@ from dase.learning.job import compose_training, make_baseline, write_examples, w
 from dase.learning.recipe import Recipe
 from dase.learning.recorded_target import ReplayedScenes, cut_windows, open_target
 from dase.learning.run import RunSchedule, train_in_folder
-from dase.learning.scene_batches import LOG_EPS, Scenery, SceneSettings
+from dase.learning.scene_batches import Scenery, SceneSettings
 from dase.learning.targets import TRUTHS, EndlessTarget, FiniteTarget, Pairs, Target, record_pairs
 from dase.learning.training import Training
 from dase.networks.threshold_network import NetworkShape
@@ -109,9 +109,8 @@ def judge(row: Row, training: Training, args: argparse.Namespace, folder: Path) 
     later = recording.slice(recording.begin + LEARNED, recording.end)
     windows = cut_windows(later)
     scenes = ReplayedScenes(windows, window=0.05, device=args.device)
-    grey = np.exp(windows.log[:, windows.log.shape[1] // 2].astype(np.float32)) - np.float32(LOG_EPS)
-    pairs = Pairs(torch.from_numpy(grey).to(args.device), torch.from_numpy(windows.counts).to(args.device))
-    held = HeldOutScore(scenes, pairs, doubt=0.2)
+    grey, counts = (torch.from_numpy(part).to(args.device) for part in (windows.grey, windows.counts))
+    held = HeldOutScore(scenes, Pairs(grey, counts), doubt=0.2)
     out: dict[str, Any] = {"trusted": windows.trusted}
     for name in row.judged:
         net = training.mean if name == "adapted" else make_baseline(name, training.target, training.scenery)

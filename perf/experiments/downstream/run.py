@@ -4,10 +4,10 @@
     python -m perf.experiments.downstream.table OUT/results.jsonl
 
 Four targets with physics beyond thresholds (`sensors.py`) are recorded for 60 s each. Networks are
-trained on ESIM's default, on broad randomisation, and for each target on S2R's tuned threshold, on what
-`dase.fit` makes of the recording, on thresholds that `dase train` learns of it (alone, by the paper's preset,
-and on top of the fit), on volumes of EventGAN (reconstruction alone), and on the true sensor;
-then tested on each target's simulated scenes of photographs that no training has seen. The same seed has
+trained on ESIM's default, on broad randomisation, on a camera's preset, and for each target on S2R's tuned
+threshold, on what `dase.fit` makes of the recording, on thresholds that `dase train` learns of it (alone, by
+the paper's preset, and on top of the fit), on volumes of EventGAN (reconstruction alone), and on the true
+sensor; then tested on each target's simulated scenes of photographs that no training has seen. A seed has
 the same first weights and scenes whatever the sensor. Each training stands alone: it is checkpointed,
 `--minutes` ends a call, the same call goes on, and several machines may take `--seeds` apart. `--jobs`
 trainings share a device: each is small, and waits for Python more than for the GPU. What waits for no fit
@@ -46,6 +46,7 @@ from dase.tasks.image_metrics import structural_similarity
 from dase.torch import Batch
 from perf.experiments.downstream.eventgan import EventGan, GanTraining, save_eventgan, train_eventgan
 from perf.experiments.downstream.sensors import (
+    CAMERA,
     FAST,
     KINDS,
     LEARNED_AFTER,
@@ -250,8 +251,8 @@ class Study:
 
     def training(self, kind: str, target: str) -> Training:
         """Return what is trained on."""
-        if kind == "esim":
-            return Training(dase.load_sensor("esim"))
+        if kind in ("esim", "preset"):
+            return Training(dase.load_sensor(CAMERA if kind == "preset" else kind))
         if kind == "broad":
             augment = dase.torch.Augment(flips=0.5, noise=0.05, hot=5e-4)
             return Training(plain_sensor(0.2), broad_thresholds, augment)

@@ -56,10 +56,13 @@ START = sensor_with(
 """From which fits set out: every effect that a user would try, at usual values; the same for all targets."""
 
 KINDS = (
-    "esim", "broad", "tuned", "eventgan", "learned", "learned_paper", "learned_on_fitted", "fitted", "true",
+    "esim", "broad", "preset", "tuned", "eventgan", "learned", "learned_paper", "learned_on_fitted", "fitted",
+    "true",
 )  # fmt: skip
-"""What is trained on; the first two do not know their target."""
-OF_NO_TARGET = KINDS[:2]
+"""What is trained on; the first three do not know their target."""
+OF_NO_TARGET = KINDS[:3]
+CAMERA = "davis240c"
+"""Of the kind `preset`: that of the real excerpts which networks of flow are tested on; no target."""
 LEARNED_BY = {
     "tuned": "tune", "eventgan": "gan", "learned": "train", "learned_paper": "train_paper",
     "learned_on_fitted": "train_on_fit", "fitted": "fit",
