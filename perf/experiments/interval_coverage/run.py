@@ -196,6 +196,8 @@ What earlier keys showed, each run once and a development set since:
   it, and bent the leak or the noise to make up for that (up to eight half widths off).
 - `intervals-2026-11-27-1`, above, was written down with that mended, before any of its cases was run. What
   it has least of, the share of weak dead pixels (60 %) and the rate of hot ones, few pixels tell.
+- `intervals-2026-11-29-1`: 30 recordings more of dead pixels, hot ones and latencies alone, written down before any of
+  them was run.
 """
 
 
