@@ -196,13 +196,14 @@ What earlier keys showed, each run once and a development set since:
   it, and bent the leak or the noise to make up for that (up to eight half widths off).
 - `intervals-2026-11-27-1`, above, was written down with that mended, before any of its cases was run. What
   it has least of, the share of weak dead pixels (60 %) and the rate of hot ones, few pixels tell.
-- `intervals-2026-11-29-1` (2113ba7, [runs](../perf/experiments/interval_coverage/further.jsonl)): 30 recordings
-  more of dead pixels, hot ones and latencies each, written down before any of them was run. `dead.share` 87 %,
-  `latency.light`, `latency.delay` and `latency.dark` 93, 97 and 93 %, `hot.share`, `hot.spread` and
-  `hot.balance` 83, 90 and 100 %, **`hot.rate` 70 %**. With those above, of 60: `dead.share` 85 % (74 to 92 %),
-  `latency.light` 88 % (78 to 94 %), `hot.share` 88 %, and **`hot.rate` 75 % (63 to 84 %), which is too few**:
-  its errors are 1.1 to 1.4 times what its intervals say. Few pixels, whose rates differ by a factor of e, make
-  it; what would tell it best, the rates of all hot pixels, the fit does not look at.
+- `intervals-2026-11-29-1` (2113ba7, [runs](../perf/experiments/interval_coverage/further.jsonl)): 30
+  recordings more of dead pixels, hot ones and latencies each, written down before any of them was run.
+  `dead.share` 87 %, `latency.light`, `latency.delay` and `latency.dark` 93, 97 and 93 %, `hot.share`,
+  `hot.spread` and `hot.balance` 83, 90 and 100 %, **`hot.rate` 70 %**. With those above, of 60:
+  `dead.share` 85 % (74 to 92 %), `latency.light` 88 % (78 to 94 %), `hot.share` 88 %, and **`hot.rate` 75
+  % (63 to 84 %), which is too few**: its errors are 1.1 to 1.4 times what its intervals say. Few pixels,
+  whose rates differ by a factor of e, make it; what would tell it best, the rates of all hot pixels, the
+  fit does not look at.
 """
 
 
