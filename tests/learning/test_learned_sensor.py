@@ -182,6 +182,17 @@ def test_bad_weights_are_named(folder, scene):
         dase.simulate(scene, load_sensor(path))
 
 
+def shown_at(texture: np.ndarray, places: np.ndarray) -> np.ndarray:
+    """Return 32 columns of a texture from each place on [texel], shape (F, H, 32)."""
+    frames = []
+    for place in places:
+        columns = np.arange(32) + place
+        whole = columns.astype(int)
+        share = columns - whole
+        frames.append((1 - share) * texture[:, whole] + share * texture[:, whole + 1])
+    return np.stack(frames)
+
+
 def moving(seconds: float = 1.0, rate: float = 0.2) -> Sequence:
     """Return frames of blobs that drift, and the events of their sensor."""
     rng = np.random.default_rng(0)
@@ -191,14 +202,7 @@ def moving(seconds: float = 1.0, rate: float = 0.2) -> Sequence:
         texture = 0.25 * (np.roll(texture, 1, 1) + np.roll(texture, -1, 1)) + 0.5 * texture
     texture = (texture - texture.min()) / np.ptp(texture)
     times = np.arange(0, seconds, 0.02)
-    columns = np.arange(32)
-    frames = []
-    for t in times:
-        place = columns + 40 * t
-        whole = place.astype(int)
-        share = place - whole
-        frames.append((1 - share) * texture[:32, whole] + share * texture[:32, whole + 1])
-    stack = np.clip(np.stack(frames), 0.02, 1)
+    stack = np.clip(shown_at(texture[:32], 40 * times), 0.02, 1)
     # one grey value at the top, or the frames would look stretched
     scene = VideoScene(stack.astype(np.float32), times)
     events = dase.simulate(scene, dase.Sensor((Threshold(on=rate, off=rate), Mismatch(spread=0.2))))
@@ -235,14 +239,7 @@ def swinging(threshold: float) -> Recording:
         texture = 0.25 * (np.roll(texture, 1, 1) + np.roll(texture, -1, 1)) + 0.5 * texture
     texture = 0.1 + 0.8 * (texture - texture.min()) / np.ptp(texture)
     times = np.arange(0, 4.0, 0.01)
-    columns = np.arange(32)
-    frames = []
-    for t in times:
-        place = columns + 12 + 3 * np.sin(4 * np.pi * t)
-        whole = place.astype(int)
-        share = place - whole
-        frames.append((1 - share) * texture[:, whole] + share * texture[:, whole + 1])
-    stack = np.stack(frames).astype(np.float32)
+    stack = shown_at(texture, 12 + 3 * np.sin(4 * np.pi * times)).astype(np.float32)
     sensor = dase.Sensor((Threshold(on=threshold, off=threshold, phase=1.0),))
     events = dase.simulate(VideoScene(stack, times), sensor)
     return Recording.of(Sequence(events, np.round(255 * stack).astype(np.uint8), times))
