@@ -61,33 +61,34 @@ def count_short_intervals(
     pixel: wp.array[int],  # (N,) row-major
     polarity: wp.array[wp.uint8],  # (N,) 1 for ON
     shared: wp.array[wp.uint8],  # (N,) 1 where many pixels send at that time
-    tie: wp.float64,  # [s]
-    near: wp.float64,  # [s]
-    far: wp.float64,  # [s]
+    edges: wp.array[wp.float64],  # (K,) [s], increasing, between which intervals are counted
     # in and out
     last: wp.array[wp.float64],  # (H * W,) [s], when each pixel was last seen
     last_interval: wp.array[wp.float64],  # (H * W,) [s], from the event before to that
     last_polarity: wp.array[wp.uint8],  # (H * W,)
-    count_out: wp.array3d[int],  # (5, 2, H * W) below `tie`, then `near`, then `far`; calm: `near`, `far`
+    count_out: wp.array4d[int],  # (3, K, 2, H * W): all intervals, those after a silence, and calm ones
+    sum_out: wp.array[wp.float64],  # (K,) [s], of all intervals
 ):
     """Count how often a pixel is soon seen again with the same polarity. Called with dim=1.
 
-    OFF and ON. Calm is what follows, at a time of its own, an event before which the pixel was silent
-    for `far`.
+    OFF and ON. After a silence is what follows an event before which the pixel was silent for as long as the
+    last edge; calm is such an interval that ends at a time of its own.
     """
+    far = edges[edges.shape[0] - 1]
     for i in range(time.shape[0]):
         place = pixel[i]
         sign = polarity[i]
         interval = time[i] - last[place]
         if sign == last_polarity[place] and interval < far:
-            kind = int(2)
-            if interval < tie:
-                kind = int(0)
-            elif interval < near:
-                kind = int(1)
-            count_out[kind, int(sign), place] += 1
-            if kind > 0 and last_interval[place] >= far and shared[i] == wp.uint8(0):
-                count_out[kind + 2, int(sign), place] += 1
+            kind = int(0)
+            while interval >= edges[kind]:
+                kind += 1
+            count_out[0, kind, int(sign), place] += 1
+            sum_out[kind] += interval
+            if last_interval[place] >= far:
+                count_out[1, kind, int(sign), place] += 1
+                if shared[i] == wp.uint8(0):
+                    count_out[2, kind, int(sign), place] += 1
         last_interval[place] = interval
         last[place] = time[i]
         last_polarity[place] = sign

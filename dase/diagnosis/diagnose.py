@@ -135,8 +135,9 @@ def diagnose(
         return replace(again(shown), seconds=time.perf_counter() - begin)
     part = part_to_simulate(measurement, state.task.evidence.when)
     seen = without_the_scene(compared.seen, part, start.sensor, seed)
-    if seen.entry_of(DOUBLE_EVENTS) is not None:
-        state.try_doubles()
+    doubles = seen.entry_of(DOUBLE_EVENTS)
+    if doubles is not None:
+        state.try_doubles(doubles.details["gap"])
     if compared.guessed is not None:
         tell("how well the scene is known", 0.0, before)
         state.doubt_scene(with_scene_doubt(state.task.evidence, compared.guessed, start, seed=seed))

@@ -134,7 +134,7 @@ class DiagnosisState:
         asked_at_frames: The model of which it was asked last whether its clip is known at its frames alone.
         evaluations_before: Simulations that were run before the measurement was split anew.
         samples_before: Pixels times samples of those.
-        doubles: Whether double events are seen, and tried.
+        double_gap: Mean time from an event to its double [s], which are tried where it is not 0.
     """
 
     task: DiagnosisTask
@@ -146,7 +146,7 @@ class DiagnosisState:
     asked_at_frames: FittedModel | None = None
     evaluations_before: int = 0
     samples_before: int = 0
-    doubles: bool = False
+    double_gap: float = 0.0
 
     @property
     def evaluations(self) -> int:
@@ -162,17 +162,17 @@ class DiagnosisState:
         """Go on with the same parts of the measurement, with what their scene is not known to."""
         self.task = replace(self.task, evidence=evidence)
 
-    def try_doubles(self) -> None:
-        """Let double events be tried: they are seen, and not of the scene."""
-        self.doubles = True
-        self.task = replace(self.task, evidence=replace(self.task.evidence, doubles=True))
+    def try_doubles(self, gap: float) -> None:
+        """Let double events be tried, that are so much later [s]: they are seen, and not of the scene."""
+        self.double_gap = gap
+        self.task = replace(self.task, evidence=replace(self.task.evidence, double_gap=gap))
 
     def split_anew(self, evidence: SplitMeasurement) -> None:
         """Go on with a split of which all of the time is fitted; what was run before counts on."""
         self.evaluations_before, self.samples_before = self.evaluations, self.samples
         self.task = replace(self.task, evidence=evidence, all_time=True)
-        if self.doubles:
-            self.try_doubles()
+        if self.double_gap:
+            self.try_doubles(self.double_gap)
 
     def count_as_given(self, name: str) -> None:
         """Count an effect as one that a model has before the search."""

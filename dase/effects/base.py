@@ -157,7 +157,7 @@ class Observations:
         row_load: The same of an arbiter that takes rows.
         column_load: The same of one that takes columns.
         stamped_again: Share of the events that a scan has stamped like the one before of their pixel.
-        doubles: Whether pixels are seen to send twice within microseconds.
+        double_gap: Mean time from an event to its double [s] where pixels are seen to send twice, else 0.
     """
 
     peak_frequency: float
@@ -178,7 +178,7 @@ class Observations:
     row_load: float = math.inf
     column_load: float = math.inf
     stamped_again: float = 0.0
-    doubles: bool = False
+    double_gap: float = 0.0
 
     @property
     def bus_is_idle(self) -> bool:

@@ -102,7 +102,7 @@ class SplitMeasurement:
         frame_step: Time from frame to frame of a clip in step with which all events come [s], 0 if they do
             not, see `frame_step_of`.
         clip_frames: Time from frame to frame of a clip [s], 0 of another scene.
-        doubles: Whether pixels are seen to send twice within microseconds.
+        double_gap: Mean time from an event to its double [s] where pixels are seen to send twice, else 0.
     """
 
     train: PixelSubset
@@ -120,7 +120,7 @@ class SplitMeasurement:
     frames: BurstTimes | None = None
     frame_step: float = 0.0
     clip_frames: float = 0.0
-    doubles: bool = False
+    double_gap: float = 0.0
 
     def observe(self, *, idle_bus: float) -> Observations:
         """Return what effects may choose their candidates by, see `Observations`."""
@@ -144,7 +144,7 @@ class SplitMeasurement:
             frame_exposure=frames.exposure if frames else 0.0,
             clip_step=self.frame_step,
             clip_frames=self.clip_frames,
-            doubles=self.doubles,
+            double_gap=self.double_gap,
         )
 
     @property

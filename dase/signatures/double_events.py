@@ -10,6 +10,9 @@ A simulator that works frame by frame sends the events of a pixel in a frame som
 apart, which hides doubles among them. But all its pixels send at the same few times, and a double has one of
 its own. Where that is as many microseconds later for all, doubles share it, too, and are seen if both
 polarities have them and hardly anything else comes within hundreds of microseconds.
+
+A slow handshake is answered twice only after some ten microseconds. What is as late could be two steps of a
+fast rise as well. So it counts where hardly any is later, and hardly ever two in a row.
 """
 
 from __future__ import annotations
@@ -38,6 +41,7 @@ class DoubleSettings:
     least: float = 1e-3  # share of the events
     tie: float = 1e-8  # [s] at one time; a handshake takes longer
     near: float = 20e-6  # [s]
+    slow: tuple[float, ...] = (40e-6, 80e-6)  # [s] tried where there are none below `near`
     far: float = 400e-6  # [s] dead times begin to show beyond it
     ratio: float = (
         6.0  # times as many per second below `near` as from there to `far`; recordings have 40 and more
@@ -49,7 +53,10 @@ class DoubleSettings:
 
     none_later: float = 0.02
     """Intervals from `near` to `far` per interval below `near`, at most, for doubles at times that many
-    pixels share: times within a frame are not always so close."""
+    pixels share: times within a frame are not always so close. So it is for those that are slow."""
+
+    alone: float = 0.9
+    """Share of slow doubles, at least, before whose first event the pixel was silent for `far`."""
 
     off_clock: float = 2.0
     """Events at times that few pixels share per double, at most, where the clock is slower than doubles: on
@@ -66,13 +73,17 @@ class IntervalCounts:
     """
 
     def __init__(self, width: int, height: int, settings: DoubleSettings | None = None):
-        self.settings = settings or DoubleSettings()
-        self.counts = np.zeros((5, 2, width * height), np.int32)
-        """Intervals below `tie`, `near` and `far`, and below `near` and `far` after as long a silence and not
-        at a time that many pixels share.
+        self.settings = s = settings or DoubleSettings()
+        self.edges = np.array([s.tie, s.near, *s.slow, s.far])
+        """Between what intervals are counted in [s], shape (K,)."""
+        self.counts = np.zeros((3, len(self.edges), 2, width * height), np.int32)
+        """All intervals, those after a silence of `far`, and those of these that end at no time which many
+        pixels share.
 
-        Of OFF and of ON events, shape (5, 2, H * W).
+        Below the first edge and between edges, of OFF and of ON events, shape (3, K, 2, H * W).
         """
+        self.sums = np.zeros(len(self.edges))
+        """Of all intervals below the first edge and between edges [s], shape (K,)."""
         self.events = np.zeros((2, width * height), np.int64)
         """OFF and ON events."""
         self.at_own_times = 0
@@ -114,15 +125,13 @@ class IntervalCounts:
         columns = (
             (events.t, wp.float64), (pixel, int), (events.p.astype(np.uint8), wp.uint8),
             (shared.astype(np.uint8), wp.uint8),
+            # whole microseconds as floating point numbers: 20 of them are not less than 20
+            (self.edges - 1e-9, wp.float64),
             (self._last, wp.float64), (self._interval, wp.float64), (self._polarity, wp.uint8),
-            (self.counts, int),
+            (self.counts, int), (self.sums, wp.float64),
         )  # fmt: skip
         arrays = [wp.array(a, dtype=d, device=self._cpu, copy=False) for a, d in columns]
-        # whole microseconds as floating point numbers: 20 of them are not less than 20
-        s = self.settings
-        limits = [wp.float64(value - 1e-9) for value in (s.tie, s.near, s.far)]
-        inputs = [*arrays[:4], *limits, *arrays[4:]]
-        wp.launch(count_short_intervals, dim=1, inputs=inputs, device=self._cpu)
+        wp.launch(count_short_intervals, dim=1, inputs=arrays, device=self._cpu)
 
 
 def times_of_many(
@@ -153,7 +162,7 @@ def find_double_events(
     The null has as many intervals per second below 20 µs as from there to 400 µs: binomial. It must fail for
     pairs of OFF events before which the pixel was silent for 400 µs and whose second does not share its time
     with many pixels, and without the busiest pixels, too: where thresholds differ, a few send dozens at a
-    jump.
+    jump. Where it does not fail, 40 and 80 µs take the place of 20.
 
     Args:
         intervals: Counted intervals.
@@ -167,28 +176,45 @@ def find_double_events(
         return without_answer(
             DOUBLE_EVENTS, f"stamps are {format_seconds(tick)} apart, which hides what is sooner"
         )
+    if int(intervals.events[:, ~hot].sum()) * s.least < 20:
+        events = format_count(int(intervals.events[:, ~hot].sum()))
+        return without_answer(
+            DOUBLE_EVENTS, f"{events} events, too few for a share of {format_percent(s.least)}"
+        )
+    soon = _look_within(intervals, 1, hot, level)
+    if soon.found:
+        return soon
+    for reach in range(2, len(intervals.edges) - 1):
+        slow = _look_within(intervals, reach, hot, level)
+        if slow.found:
+            return slow
+    return soon
+
+
+def _look_within(intervals: IntervalCounts, reach: int, hot: NDArray[np.bool_], level: float) -> Signature:
+    """Look for doubles that are sooner than an edge, by its number; beyond 1 they are slow."""
+    s, edge = intervals.settings, float(intervals.edges[reach])
     count = intervals.events.sum(0)
     busy = float(np.quantile(count[~hot], s.bulk)) if np.any(~hot) else 0.0
-    ties, near, rest = (int(row[:, ~hot].sum()) for row in intervals.counts[:3])
+    every = intervals.counts[0][:, :, ~hot].sum((1, 2))
+    ties, near, rest = int(every[0]), int(every[1 : reach + 1].sum()), int(every[reach + 1 :].sum())
     events = int(count[~hot].sum())
-    if events * s.least < 20:
-        return without_answer(
-            DOUBLE_EVENTS, f"{format_count(events)} events, too few for a share of {format_percent(s.least)}"
-        )
-    chance = s.near / s.far
-    p = max(_chance_of(intervals, some) for some in (~hot, ~hot & (count <= busy)))
+    chance = edge / s.far
+    looks = 1 + len(s.slow)
+    p = min(looks * max(_chance_of(intervals, reach, some) for some in (~hot, ~hot & (count <= busy))), 1.0)
     low, high = (limit / events for limit in poisson_interval(near))
-    share = near / events
+    share, within = near / events, format_seconds(edge)
     hidden = ", most of these where many pixels send at one time"
     at_once = hidden if p < 1 and near * (1 / chance - 1) < s.ratio * rest else ""
+    sums, numbers = intervals.sums[1 : reach + 1].sum(), intervals.counts[0, 1 : reach + 1].sum()
     entry = Signature(
         name=DOUBLE_EVENTS, answer=Answer.NOT_SEEN, p=p, size=share, low=low, high=high,
         unit="share of the events", least=s.least,
-        sentence=f"{format_count(near)} events ({format_percent(share)}) within 20 µs of the same "
+        sentence=f"{format_count(near)} events ({format_percent(share)}) within {within} of the same "
         f"pixel's last of the same polarity, {format_count(rest)} from there to 400 µs{at_once}",
-        details={"near": near, "later": rest, "at_once": ties},
+        details={"near": near, "later": rest, "at_once": ties, "gap": float(sums / max(numbers, 1))},
     )  # fmt: skip
-    unseen = f"{format_percent(share)} of the events within 20 µs of the same pixel's last"
+    unseen = f"{format_percent(share)} of the events within {within} of the same pixel's last"
     if share >= s.least and p == 1.0:
         unseen += ", which have caught up or follow each other fast"
     if rest > 2 * near * (1 / chance - 1) / s.ratio:
@@ -207,20 +233,26 @@ def _leave_the_clock(intervals: IntervalCounts, hot: NDArray[np.bool_]) -> bool:
     events have times of their own.
     """
     s = intervals.settings
-    doubles = int(intervals.counts[1][:, ~hot].sum())
+    doubles = int(intervals.counts[0, 1][:, ~hot].sum())
     enough = doubles >= s.least * int(intervals.events[:, ~hot].sum())
     return enough and intervals.at_own_times <= s.off_clock * doubles
 
 
-def _chance_of(intervals: IntervalCounts, some: NDArray[np.bool_]) -> float:
+def _chance_of(intervals: IntervalCounts, reach: int, some: NDArray[np.bool_]) -> float:
     """Return p of the null for some pixels, shape (H * W,); 1 if there are too few doubles."""
-    s, chance = intervals.settings, intervals.settings.near / intervals.settings.far
+    s, chance = intervals.settings, float(intervals.edges[reach]) / intervals.settings.far
     least = s.least * intervals.events[:, some].sum(1)
-    soon, later = (int(row[0, some].sum()) for row in intervals.counts[3:])
-    if soon * (1 / chance - 1) < s.ratio * later or not soon or soon < least[0]:
+    bins = intervals.counts[:, :, :, some].sum(3)
+    every, silent, calm = bins[:, 1 : reach + 1].sum(1)  # OFF and ON
+    later, _, calm_later = bins[:, reach + 1 :].sum(1)
+    if reach > 1 and (later[0] > s.none_later * every[0] or silent[0] < s.alone * every[0]):
+        return 1.0
+    soon, rest = int(calm[0]), int(calm_later[0])
+    if soon * (1 / chance - 1) < s.ratio * rest or not soon or soon < least[0]:
         # fast, but no faster than fast, or others have caught up with each other, or times are shared
-        near, far = (row[:, some].sum(1) for row in intervals.counts[1:3])
-        if np.any(near < np.maximum(least, 1)) or np.any(far > s.none_later * near):
+        if np.any(every < np.maximum(least, 1)) or np.any(later > s.none_later * every):
             return 1.0
-        soon, later = int(near[0]), int(far[0])
-    return float(stats.binom.sf(soon - 1, soon + later, chance))
+        if reach > 1 and np.any(silent < s.alone * every):
+            return 1.0
+        soon, rest = int(every[0]), int(later[0])
+    return float(stats.binom.sf(soon - 1, soon + rest, chance))

@@ -32,6 +32,7 @@ def test_noise_is_found_beside_double_events(scene):
     assert {one.effect: one.grade for one in found.findings}["double_events"] is Grade.CERTAIN
     assert "shot" in found.selected
     assert found.sensor["double_events"].share == pytest.approx(0.2, rel=0.2)
+    assert found.sensor["double_events"].delay == pytest.approx(DoubleEvents().delay, rel=0.2)
     assert found.errors[-1] < found.gate
 
 
@@ -40,6 +41,6 @@ def test_double_events_are_tried_only_where_they_are_seen(scene):
     evidence = split_measurement(measurement, pixels=100)
     state = DiagnosisState(DiagnosisTask(evidence, LIBRARY, 0, lambda *_: None, frozenset()))
     assert DoubleEvents.candidates(state.task.evidence.observe(idle_bus=0.01)) == []
-    state.try_doubles()
+    state.try_doubles(33e-6)
     state.split_anew(replace(evidence))
-    assert DoubleEvents.candidates(state.task.evidence.observe(idle_bus=0.01)) == [DoubleEvents()]
+    assert DoubleEvents.candidates(state.task.evidence.observe(idle_bus=0.01)) == [DoubleEvents(delay=33e-6)]

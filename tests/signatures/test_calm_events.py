@@ -52,7 +52,7 @@ def test_calm_share_equals_a_loop(rng, size):
 @pytest.mark.parametrize("size", [600, 7])
 def test_short_intervals_equal_a_loop(rng, size):
     e = some(rng, width=3, height=2)
-    looked = IntervalCounts(3, 2, DoubleSettings(tie=1e-4, near=1e-3, far=5e-3, shared=0.05))
+    looked = IntervalCounts(3, 2, DoubleSettings(tie=1e-4, near=1e-3, slow=(2e-3,), far=5e-3, shared=0.05))
     for part in pieces(e, size):
         looked.push(part)
     looked.finish()
@@ -62,19 +62,24 @@ def test_short_intervals_equal_a_loop(rng, size):
     own_time = at_once <= 0.05 * around
     assert np.array_equal(times_of_many(e.t, slice(50, 90), looked.settings), ~own_time[50:90])
     assert 0.1 < own_time.mean() < 0.9
+    in_all = []
     for k in range(6):
         t, p, alone = e.t[pixel == k], e.p[pixel == k], own_time[pixel == k][1:]
         gaps, same = np.diff(t), p[1:] == p[:-1]
-        calm = same & (np.concatenate(([np.inf], gaps[:-1])) >= 5e-3 - 1e-9)
+        silent = same & (np.concatenate(([np.inf], gaps[:-1])) >= 5e-3 - 1e-9)
         for polarity in (False, True):
             rows = []
-            for chosen in (same, calm & alone):
+            for chosen in (same, silent, silent & alone):
                 own = gaps[chosen & (p[1:] == polarity)]
-                below = [np.count_nonzero(own < limit - 1e-9) for limit in (1e-4, 1e-3, 5e-3)]
+                below = [np.count_nonzero(own < limit - 1e-9) for limit in (1e-4, 1e-3, 2e-3, 5e-3)]
                 rows.append(np.diff(below, prepend=0).tolist())
-            assert looked.counts[:, int(polarity), k].tolist() == [*rows[0], *rows[1][1:]]
+            assert looked.counts[:, :, int(polarity), k].tolist() == rows
+            in_all += [gaps[same & (p[1:] == polarity)]]
         assert looked.events[:, k].sum() == np.count_nonzero(pixel == k)
         assert looked.events[1, k] == np.count_nonzero(e.p[pixel == k])
+    gaps, edges = np.concatenate(in_all), looked.edges - 1e-9
+    sums = np.bincount(np.searchsorted(edges, gaps, side="right"), gaps, len(edges) + 1)
+    assert looked.sums == pytest.approx(sums[:-1])
 
 
 @pytest.mark.parametrize("size", [600, 13])

@@ -399,9 +399,11 @@ def test_events_at_parts_of_a_frame_are_not_double(rng, most):
     assert not dase.find_signatures(in_turn(rng, 0.0, most))["double events"].found
 
 
-@pytest.mark.parametrize(("after", "shown"), [((4,), True), ((12, 52), False), ((4, 40), False)])
+@pytest.mark.parametrize(
+    ("after", "shown"), [((4,), True), ((12, 52), False), ((4, 40), False), ((33, 70), False)]
+)
 def test_doubles_show_that_come_as_soon_after_each_frame_for_all_pixels(rng, after, shown):
-    """A simulator's pixels send at its frames of 2.5 ms alone; parts of a frame would go on after 20 us."""
+    """A simulator's pixels send at its frames of 2.5 ms alone; parts of a frame would go on after a first."""
     frame, pixel = np.repeat(np.arange(200), 150), rng.integers(0, 900, 200 * 150)
     t = 2500.0 * frame
     again = rng.permutation(np.flatnonzero(rng.random(len(t)) < 0.1))
@@ -412,6 +414,23 @@ def test_doubles_show_that_come_as_soon_after_each_frame_for_all_pixels(rng, aft
     x, y = ((pixel[order] % 30).astype(np.uint16), (pixel[order] // 30).astype(np.uint16))
     events = Events(t[order] * 1e-6, x, y, on[order], 30, 30)
     assert dase.find_signatures(events)["double events"].found == shown
+
+
+@pytest.mark.parametrize(("low", "slowest", "shown"), [(25, 75, True), (0, 300, False)])
+def test_slow_doubles_show_where_nothing_is_later(rng, low, slowest, shown):
+    """Of OFF events alone, at times of their own; the two events of a fast rise are as late as it is long."""
+    t, pixel = rng.uniform(0, 20e6, 60_000), rng.integers(0, 900, 60_000)
+    on = pixel % 3 > 0
+    again = np.flatnonzero((rng.random(len(t)) < 0.05) & ~on)
+    t = np.concatenate([t, t[again] + rng.uniform(low, slowest, len(again))])
+    pixel, on = np.concatenate([pixel, pixel[again]]), np.concatenate([on, on[again]])
+    order = np.argsort(t, kind="stable")
+    x, y = ((pixel[order] % 30).astype(np.uint16), (pixel[order] // 30).astype(np.uint16))
+    entry = dase.find_signatures(Events(t[order] * 1e-6, x, y, on[order], 30, 30))["double events"]
+    assert entry.found == shown
+    if shown:
+        assert "within 80 µs" in entry.sentence
+        assert entry.details["gap"] == pytest.approx(50e-6, rel=0.05)
 
 
 @pytest.mark.parametrize(("share", "noise", "shown"), [(0.05, 0, True), (0.0, 0, False), (0.0, 4, False)])
