@@ -173,7 +173,8 @@ def _look_for_dead_time(
         return seen
     found = find_dead_time(
         measurement, model.sensor,
-        frame_step=task.evidence.frame_step or 0.0, structure=task.evidence.structure, seed=task.seed,
+        frame_step=task.evidence.frame_step or 0.0, structure=task.evidence.structure,
+        lamp=seen.lamp is not None, seed=task.seed,
     )  # fmt: skip
     return seen if found is None else replace(seen, entries=(*seen.entries, found))
 

@@ -10,7 +10,7 @@ import pytest
 from helpers.brief_diagnosis import NO_LIMITS
 
 import dase
-from dase.diagnosis import seen_beside_model
+from dase.diagnosis import dead_time, seen_beside_model
 from dase.diagnosis.dead_time import DEAD_TIME, end_of_intervals, find_dead_time, intervals_of
 from dase.diagnosis.late_light import time_of_delay
 from dase.diagnosis.seen_effects import SeenEffects
@@ -122,6 +122,20 @@ def test_a_few_random_events_in_the_dead_time_hide_it_not():
     assert entry.details["here"] <= DEAD_TIME.left * lost
     many = np.sort(np.concatenate([seen, rng.uniform(0, 5e-3, int(0.05 * lost))]))
     assert end_of_intervals(many, modelled) is None
+
+
+def test_under_a_lamp_more_intervals_must_be_lost(scene, monkeypatch):
+    """Of a thousand that are lost among a hundred thousand a pole under a lamp is as likely the cause."""
+    rng = np.random.default_rng(1)
+    modelled = np.sort(rng.gamma(3.0, 4e-3, 100_000))
+    for end, told in ((1.7e-3, False), (5e-3, True)):
+        lost = np.searchsorted(modelled, end)
+        assert DEAD_TIME.lost < lost
+        lists = iter([modelled[lost:], modelled] * 2)
+        monkeypatch.setattr(dead_time, "intervals_of", lambda *given, some=lists: next(some))
+        events = dase.simulate(scene, Sensor(), seed=1)
+        assert found(scene, events, Sensor()) is not None
+        assert (found(scene, events, Sensor(), lamp=True) is not None) is told
 
 
 def test_an_end_later_than_any_dead_time_tells_nothing():
