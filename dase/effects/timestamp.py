@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar, Self
 
 import numpy as np
 
-from dase.effects.base import Observations, parameter
+from dase.effects.base import Effect, Observations, parameter
 from dase.effects.made_signatures import Makes
 from dase.effects.stream import (
     FOREVER,
@@ -23,6 +24,9 @@ from dase.effects.stream import (
 )
 from dase.errors import InputError
 from dase.events import Events
+
+SMALL = 2e-5
+"""Errors of the stamps up to this are far below the steps in which statistics see time [s]."""
 
 
 class Stamp(Reader):
@@ -89,9 +93,8 @@ class Timestamp(StreamEffect):
         unit="s",
         off=0.0,
         bounds=(0.0, 0.1),
-        plausible=(1e-7, 1e-3),
+        plausible=(1e-6, 2e-3),
         about="standard deviation of the time stamps",
-        fitted=False,  # mostly far below the steps in which statistics see time
     )
     step: float = parameter(
         1e-6,
@@ -110,8 +113,12 @@ class Timestamp(StreamEffect):
 
     @classmethod
     def candidates(cls, observed: Observations) -> list[Self]:
-        """Return the clock that is seen in the time stamps, if any is."""
-        return [cls(step=observed.clock_period, jitter=0.0)] if observed.clock_period else []
+        """Return the clock that is seen in the time stamps; where none is, stamps that are off."""
+        return [cls(step=observed.clock_period, jitter=0.0 if observed.clock_period else 1e-3)]
+
+    def idle(self, beside: Sequence[Effect]) -> tuple[str, ...]:
+        """Return the names of the parameters that change nothing, of errors too small for any statistic."""
+        return ("jitter",) if self.jitter < SMALL else ()
 
     def longest_delay(self, lines: int) -> float:
         """Return about how late it makes events [s]."""
