@@ -12,6 +12,7 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from dase.effects.mismatch import Mismatch
 from dase.effects.threshold import Threshold
@@ -251,7 +252,7 @@ def compose_training(
     return Training(recipe, net, objective, target, scenery, physics)
 
 
-def _textured_scenery(job: Job, looks: SceneSettings) -> Scenery:
+def _textured_scenery(job: Job, looks: SceneSettings, lead: NDArray[np.float64] | None = None) -> Scenery:
     if job.images == "frames":
         raise InputError("images: frames are those of recordings; a sensor file has none", argument="images")
     source = image_sources.open_images(job.images)
@@ -259,8 +260,9 @@ def _textured_scenery(job: Job, looks: SceneSettings) -> Scenery:
     # a scene shows ten objects, so few of them make few different scenes, unlike the target's
     backgrounds = 24 if small else 96
     return Scenery(
-        source, looks, device=job.backend, seed=job.seed, backgrounds=backgrounds, objects=8 * backgrounds
-    )
+        source, looks, device=job.backend, seed=job.seed, backgrounds=backgrounds, objects=8 * backgrounds,
+        lead=lead,
+    )  # fmt: skip
 
 
 def _open_recorded(job: Job, progress: Callable[[str, int, int], None]) -> tuple[Target, Scenery]:
@@ -279,7 +281,8 @@ def _open_recorded(job: Job, progress: Callable[[str, int, int], None]) -> tuple
     looks = replace(
         job.scene_settings(), width=scenery.scene_settings.width, height=scenery.scene_settings.height
     )
-    return target, _textured_scenery(job, looks)
+    # a camera's pixels come to a window with a past
+    return target, _textured_scenery(job, looks, scenery.lead)
 
 
 def simulate_target(

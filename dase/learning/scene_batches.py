@@ -35,13 +35,9 @@ class Scenery:
         seed: Draws the pool.
         backgrounds: Textures in the pool for backgrounds.
         objects: Textures in the pool for things in front.
-
-    Attributes:
         lead: Times of the samples that lead up to a window, from its begin [s], below 0, shape (L,); events
-            in them do not count. Scenes of textures have none: nothing was there before.
+            in them do not count. None for none: nothing was there before, as before a simulated target's.
     """
-
-    lead: NDArray[np.float64] = np.empty(0)
 
     def __init__(
         self,
@@ -52,8 +48,10 @@ class Scenery:
         seed: int = 0,
         backgrounds: int = 48,
         objects: int = 96,
+        lead: NDArray[np.float64] | None = None,
     ):
         self.scene_settings, self.device = looks, torch.device(device)
+        self.lead = np.empty(0) if lead is None else lead
         rng = TrainingDraw.TEXTURES.generator(seed)
         grounds = [
             image_sources.fit_picture(source.background(rng).grey, *image_sources.BACKGROUND)
@@ -79,7 +77,7 @@ class Scenery:
     def with_looks(self, looks: SceneSettings) -> Scenery:
         """Return scenery of the same textures."""
         other = object.__new__(Scenery)
-        other.__dict__.update(self.__dict__, looks=looks)
+        other.__dict__.update(self.__dict__, scene_settings=looks)
         return other
 
     def split(self, share: float) -> tuple[Scenery, Scenery]:
@@ -106,7 +104,7 @@ class Scenery:
         which = np.where(motion.there, front, len(self.size) - 1)
         size = self.size[which]
         size[:, 0] = image_sources.BACKGROUND[::-1]
-        place, box = motion.texture_maps(looks, size)
+        place, box = motion.texture_maps(looks, size, self.lead)
         ground = rng.integers(len(self.grey), size=count).astype(np.int32)
         return pack_words(ground, self.start[which], size, place, box)
 
@@ -114,7 +112,8 @@ class Scenery:
         """Return log intensities of what `numbers` drew, shape (count, L + samples, height, width)."""
         looks, layers = self.scene_settings, most_layers(self.scene_settings)
         pair = (count, layers)
-        shapes = (count,), pair, (*pair, 2), (count, looks.samples, layers, 2, 3), (*pair, 4)
+        samples = len(self.lead) + looks.samples
+        shapes = (count,), pair, (*pair, 2), (count, samples, layers, 2, 3), (*pair, 4)
         ground, start, size, place, box = unpack_words(numbers, *shapes)
         return bridge.render_log(
             self.grey, self.texels, ground, start, size, place.view(torch.float32), box.view(torch.float32),

@@ -63,20 +63,27 @@ class LayerMotions:
     there: NDArray[np.bool_]
 
     def texture_maps(
-        self, looks: SceneSettings, size: NDArray[np.int32]
+        self, looks: SceneSettings, size: NDArray[np.int32], lead: NDArray[np.float64] | None = None
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Return maps from sensor to texture (B, K, L, 2, 3) and boxes (B, L, 4), as `LayerScene` has them.
 
         Args:
             looks: Size of the sensor and number of samples.
             size: Width and height of the textures [texel], shape (B, L, 2).
+            lead: Times of samples before the window, from its begin [s], below 0: layers come from where
+                their paths lead back to, of which K then counts the samples, too. None for none.
         """
-        share = np.linspace(0, 1, looks.samples)[None, :, None]
+        before = np.empty(0) if lead is None else lead / looks.window
+        share = np.concatenate([before, np.linspace(0, 1, looks.samples)])[None, :, None]
 
         def at(ends: NDArray[np.float64]) -> NDArray[np.float64]:
             return np.asarray(ends[:, None, :, 0] + share * (ends[:, None, :, 1] - ends[:, None, :, 0]))
 
         x, y, angle, sx, sy = (at(a) for a in (self.x, self.y, self.angle, self.scale_x, self.scale_y))
+        # zooming, followed far back, would turn a layer over
+        sx, sy = (
+            np.maximum(s, 0.5 * ends.min(-1)[:, None]) for s, ends in ((sx, self.scale_x), (sy, self.scale_y))
+        )
         unit = size.max(-1).astype(np.float64)
         wide, high = size[:, 0, 0], size[:, 0, 1]
         unit[:, 0] = np.minimum(wide, high * looks.width / looks.height)

@@ -304,6 +304,19 @@ def test_a_part_of_a_recording_is_learned_from(tmp_path):
         open_target([path], begin=5.0)
 
 
+def test_textures_beside_a_recording_are_led_up_to_as_its_windows_are(tmp_path):
+    path = written(tmp_path / "one.npz", moving(0.8))
+    job = learning_job.Job(targets=(str(path),), images="builtin", preset="tiny", steps=2)
+    training = learning_job.open_training(job)
+    _, replayed = open_target([path], samples=12)
+    np.testing.assert_array_equal(training.scenery.lead, replayed.lead)
+    looks, lead = training.scenery.scene_settings, len(replayed.lead)
+    log = training.scenery.draw(np.random.default_rng(1), 2)
+    assert log.shape == (2, lead + looks.samples, 32, 32)
+    assert (log[:, 1:lead] != log[:, : lead - 1]).float().mean() > 0.2  # it moves before the window, too
+    training.advance()
+
+
 def test_a_part_of_a_recording_is_asked_for_in_the_command(tmp_path):
     path = written(tmp_path / "one.npz", moving(0.8))
     out = tmp_path / "out"

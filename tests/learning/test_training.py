@@ -61,7 +61,12 @@ def scenes() -> scene_batches.Scenery:
 
 
 def test_batches_show_what_layer_scenes_show(scenes):
-    log = scenes.draw(np.random.default_rng(5), 2)
+    """So do samples that lead up to a window, of layers whose paths are followed back."""
+    window = scenes.scene_settings.window
+    led = scene_batches.Scenery.__new__(scene_batches.Scenery)
+    led.__dict__.update(scenes.__dict__, lead=np.array([-window, -0.5 * window]))
+    log = led.draw(np.random.default_rng(5), 2)
+    np.testing.assert_array_equal(log[:, 2:], scenes.draw(np.random.default_rng(5), 2))
     rng = np.random.default_rng(5)
     motion = scene_batches.draw_motion(rng, scenes.scene_settings, 2)
     front = rng.integers(len(scenes.size) - 1, size=motion.there.shape)
@@ -70,7 +75,8 @@ def test_batches_show_what_layer_scenes_show(scenes):
         layers = []
         for n in np.flatnonzero(motion.there[b]):
             names = ("x", "y", "angle", "scale_x", "scale_y")
-            how = Motion(**{name: tuple(getattr(motion, name)[b, n]) for name in names})
+            ends = {name: getattr(motion, name)[b, n] for name in names}
+            how = Motion(**{name: (2 * begin - end, end) for name, (begin, end) in ends.items()})
             grey = scenes.grey[ground[b]].numpy().reshape(BACKGROUND)
             picture = Picture(grey)
             if n:
@@ -80,8 +86,8 @@ def test_batches_show_what_layer_scenes_show(scenes):
                 light = np.where(alpha > 0, texels[..., 0] / np.maximum(alpha, 1e-9), 0).astype(np.float32)
                 picture = Picture(light, alpha)
             layers.append(Layer(picture, how))
-        scene = LayerScene(layers, width=SIDE, height=SIDE, duration=scenes.scene_settings.window)
-        want = scene.frames(np.linspace(0, scenes.scene_settings.window, 6))
+        scene = LayerScene(layers, width=SIDE, height=SIDE, duration=2 * window)
+        want = scene.frames(np.array([0, 0.5, *np.linspace(1, 2, 6)]) * window)
         np.testing.assert_allclose(np.exp(log[b].numpy()) - scene_batches.LOG_EPS, want, atol=1e-5)
 
 
