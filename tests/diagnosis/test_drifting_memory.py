@@ -22,7 +22,7 @@ from dase.fitting.measurement import Measurement
 from dase.probes.timestamp_patterns import TimestampStructure
 from dase.results import Grade
 from dase.signatures.frame_coupling import BurstClock
-from dase.signatures.kinds import DEAD_TIME, DRIFTING_MEMORY
+from dase.signatures.kinds import DEAD_TIME, DRIFTING_MEMORY, FULL_BUS
 from dase.signatures.result import Answer, Signature
 from dase.simulation.sensor import Sensor
 
@@ -135,6 +135,9 @@ def test_beside_a_dead_time_it_is_not_asked(scene):
     ended = Signature(name=DEAD_TIME, answer=Answer.FOUND, sentence="ends")
     # nor beside bursts, which move the memory: one clip of DVS-Voltmeter's noise had a leak of 30 Hz
     clock = BurstClock(np.array([0.0]), 0.02, np.zeros((0, 2)))
-    for entries, bursts, leaks in (((), None, True), ((ended,), None, False), ((), clock, False)):
+    # nor behind a full bus, where events wait and are lost: one of IEBCS had a leak beside it
+    full = replace(ended, name=FULL_BUS)
+    ways = (((), None, True), ((ended,), None, False), ((), clock, False), ((full,), None, False))
+    for entries, bursts, leaks in ways:
         seen = _look_at_thresholds(task, SeenEffects(entries, bursts=bursts), measurement, model)
         assert (seen.entry_of(DRIFTING_MEMORY) is not None) == leaks

@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 
 import dase
-from dase.diagnosis.seen_effects import find_seen_effects, without_the_scene
+from dase.diagnosis.seen_effects import find_seen_effects, is_beat_of_bursts, without_the_scene
 from dase.effects import EFFECTS
 from dase.effects.high_pass import HighPass
 from dase.fitting.measurement import Measurement
 from dase.scenes.video import VideoScene
-from dase.signatures.kinds import FIXED_PATTERN
+from dase.signatures.kinds import FIXED_PATTERN, FLICKER
+from dase.signatures.result import Answer, Signature
 from dase.simulation.sensor import Sensor
 
 SENSOR = Sensor().with_effect(EFFECTS["threshold"](on=0.2, off=0.2))
@@ -53,3 +54,20 @@ def test_a_pattern_of_thresholds_is_the_cameras():
     seen = find_seen_effects(measurement, EFFECTS)
     assert seen.entry_of(FIXED_PATTERN) is not None
     assert without_the_scene(seen, measurement, SENSOR, 1).entry_of(FIXED_PATTERN) is not None
+
+
+@pytest.mark.parametrize(
+    ("frequency", "swing", "step", "beats"),
+    [
+        (49.95, 0.04, 2e-3, True),  # three bursts are 50 frames, and 5 turns
+        (45.0, 0.04, 2e-3, False),  # two bursts are 33.3 frames
+        (100.0, 0.3, 2e-3, False),  # ten turns of three bursts, and a strong lamp
+        (100.0, 0.04, 0.0, False),  # a camera's
+        (117.0, 0.04, 2e-3, False),
+    ],
+)
+def test_a_weak_tone_in_step_with_bursts_and_frames_is_no_lamp(frequency, swing, step, beats):
+    entry = Signature(
+        name=FLICKER, answer=Answer.FOUND, sentence="light", size=swing, details={"frequency": frequency}
+    )
+    assert is_beat_of_bursts(entry, 0.03332, step) is beats
