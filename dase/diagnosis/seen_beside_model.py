@@ -147,6 +147,8 @@ def settle_jitter(
     """
     if JITTER not in task.added_to(model) or seen.lamp or task.evidence.frame_step:
         return seen
+    if seen.entry_of(FULL_BUS):
+        return seen
     found = find_jitter_beside(measurement, model, judgement, noise=events_alone.noise, seed=task.seed)
     return seen if found is None else replace(seen, entries=(*seen.entries, found))
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,14 +12,17 @@ from helpers.frame_simulator import counted_between_frames, shaken_texture
 from helpers.own_effects import effect_that_makes
 
 import dase
+from dase.diagnosis import seen_beside_model
 from dase.diagnosis.light_between_events import LightBetweenEvents, LightSteps
 from dase.diagnosis.redrawn_thresholds import REDRAWN, find_redrawn_thresholds, runs_of
+from dase.diagnosis.seen_beside_model import settle_jitter
 from dase.diagnosis.seen_effects import SeenEffects
+from dase.diagnosis.state import EventsAlone
 from dase.effects import EFFECTS
 from dase.events import Events
 from dase.fitting.measurement import Measurement
 from dase.results import Finding, Grade
-from dase.signatures.kinds import REDRAWN_THRESHOLDS
+from dase.signatures.kinds import FULL_BUS, REDRAWN_THRESHOLDS
 from dase.signatures.result import Answer, Signature
 from dase.simulation.sensor import Sensor
 
@@ -147,6 +151,19 @@ def test_one_of_the_users_own_may_make_it():
     assert not seen.may_name(REDRAWN_THRESHOLDS)
     mine = Finding("popping", Grade.SUPPORTED)
     assert seen.findings([mine], ()) == [mine]
+
+
+def test_behind_a_full_bus_it_is_not_asked(scene, monkeypatch):
+    """Light goes on while events wait: a jitter of 9 % was certain beside a bus of a small simulator."""
+    told = Signature(name=REDRAWN_THRESHOLDS, answer=Answer.FOUND, sentence="drawn anew")
+    monkeypatch.setattr(seen_beside_model, "find_jitter_beside", lambda *given, **more: told)
+    task = SimpleNamespace(
+        added_to=lambda model: ("jitter",), evidence=SimpleNamespace(frame_step=0.0), seed=0
+    )
+    full = Signature(name=FULL_BUS, answer=Answer.FOUND, sentence="full")
+    for entries, asked in (((), True), ((full,), False)):
+        seen = settle_jitter(task, EventsAlone(), SeenEffects(entries), None, None, None)
+        assert (seen.entry_of(REDRAWN_THRESHOLDS) is told) is asked
 
 
 @pytest.mark.slow
