@@ -200,7 +200,7 @@ def _look_at_thresholds(
     hidden = seen.entry_of(LEAK_EVENTS) or seen.entry_of(DEAD_TIME) or returns
     # a burst moves the memory, of pixels that have been silent for longest the likelier; what waits for a
     # bus, or is lost there, tells of another light
-    hidden = hidden or seen.bursts is not None or seen.entry_of(FULL_BUS)
+    hidden = hidden or seen.bursts is not None or seen.entry_of(FULL_BUS) is not None
     if LEAKING not in task.given and not hidden:
         structure = task.evidence.structure
         found.append(find_drifting_memory(light, model.sensor, structure=structure, seed=task.seed))
