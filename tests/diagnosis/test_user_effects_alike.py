@@ -118,8 +118,9 @@ def test_no_candidate_where_the_measurement_shows_none():
     nothing = Observations(
         100.0, 0.0, 0.0, "down", 1e3, 0.001, 0.01, bus_load=0.001, row_load=0.002, column_load=0.002
     )
-    for effect in (Timestamp, RowScan, Readout):
+    for effect in (RowScan, Readout):
         assert effect.candidates(nothing) == []
+    assert [one.step for one in Timestamp.candidates(nothing)] == [0.0]  # stamps that are off have no ticks
     assert len(Flicker.candidates(nothing)) > 0
     assert Flicker.candidates(replace(nothing, peak_chance=0.5)) == []
 

@@ -86,9 +86,10 @@ def test_stopped_and_resumed_gives_the_same_weights(train, network, settings, tm
         train(network, batches, tmp_path / "parts", replace(settings, steps=9))
 
 
-@pytest.mark.parametrize("network", [FireNet(5, 4), E2VidNet(5, 4)], ids=["firenet", "e2vid"])
-def test_a_scene_of_two_batches_is_the_scene_as_one(network):
-    batch = made_batch(0)
+@pytest.mark.parametrize("kind", [FireNet, E2VidNet])
+def test_a_scene_of_two_batches_is_the_scene_as_one(kind):
+    torch.manual_seed(0)  # with some weights what is remembered hardly counts
+    network, batch = kind(5, 4), made_batch(0)
     memory = CarriedMemory()
     one, other = (memory.sequence(network, replace(batch, reset=made_batch(n).reset)) for n in (0, 1))
     whole, _ = network.sequence(batch.inputs.repeat(2, 1, 1, 1, 1))
