@@ -44,7 +44,7 @@ from dase.fitting.scene_doubt import with_scene_doubt
 from dase.probes.distance import Judgement, leaves_nothing, reaches_floor, worst_families
 from dase.probes.random_streams import SimulationStream
 from dase.results import Step
-from dase.signatures.kinds import FULL_BUS, REDRAWN_THRESHOLDS
+from dase.signatures.kinds import REDRAWN_THRESHOLDS
 
 
 def search_effects(
@@ -333,7 +333,7 @@ def _find_jitter(
     if JITTER not in effects_to_try(task.effects, model) or compared.seen.lamp:
         return None
     # where events come at fractions of frames or wait for a bus, light between them says little of thresholds
-    if task.evidence.frame_step or compared.seen.entry_of(FULL_BUS):
+    if task.evidence.frame_step or compared.seen.full_bus:
         return None
     if not compared.seen.may_name(REDRAWN_THRESHOLDS):
         return None

@@ -33,7 +33,6 @@ from dase.results import is_worse
 from dase.signatures.kinds import (
     DEAD_TIME,
     FIXED_PATTERN,
-    FULL_BUS,
     LATE_EVENTS,
     LEAK_EVENTS,
     NOISE_AT_REST,
@@ -145,9 +144,7 @@ def settle_jitter(
         model: The last one; a jitter of its own is left out.
         judgement: Its held-out error.
     """
-    if JITTER not in task.added_to(model) or seen.lamp or task.evidence.frame_step:
-        return seen
-    if seen.entry_of(FULL_BUS):
+    if JITTER not in task.added_to(model) or seen.lamp or task.evidence.frame_step or seen.full_bus:
         return seen
     found = find_jitter_beside(measurement, model, judgement, noise=events_alone.noise, seed=task.seed)
     return seen if found is None else replace(seen, entries=(*seen.entries, found))
@@ -198,9 +195,8 @@ def _look_at_thresholds(
     noise = seen.entry_of(NOISE_AT_REST)
     returns = noise is not None and "returning" in noise.details
     hidden = seen.entry_of(LEAK_EVENTS) or seen.entry_of(DEAD_TIME) or returns
-    # a burst moves the memory, of pixels that have been silent for longest the likelier; what waits for a
-    # bus, or is lost there, tells of another light
-    hidden = hidden or seen.bursts is not None or seen.entry_of(FULL_BUS) is not None
+    # a burst moves the memory, of pixels that have been silent for longest the likelier
+    hidden = hidden or seen.bursts is not None or seen.full_bus
     if LEAKING not in task.given and not hidden:
         structure = task.evidence.structure
         found.append(find_drifting_memory(light, model.sensor, structure=structure, seed=task.seed))
@@ -213,7 +209,7 @@ def _look_for_late_events(
     """Return what is seen, with the ways in which events are late."""
     known = makers_of(LATE_EVENTS, {**EFFECTS, **task.effects})
     # a bus makes events late, too, and a lamp and bursts make some that light does not
-    hidden = seen.lamp or seen.bursts is not None or seen.entry_of(FULL_BUS) is not None
+    hidden = seen.lamp or seen.bursts is not None or seen.full_bus
     if task.evidence.contradiction or hidden or task.given.intersection(known):
         return seen
     frame_step = task.evidence.frame_step or 0.0

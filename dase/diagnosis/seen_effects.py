@@ -37,6 +37,7 @@ from dase.signatures.kinds import (
     FIXED_PATTERN,
     FLICKER,
     FRAME_COUPLING,
+    FULL_BUS,
     HOT_PIXELS,
     KINDS,
     LATE_EVENTS,
@@ -85,6 +86,11 @@ class SeenEffects:
         """Frequency of light that flickers [Hz]; None where there is none."""
         entry = self.entry_of(FLICKER)
         return float(entry.details["frequency"]) if entry else None
+
+    @property
+    def full_bus(self) -> bool:
+        """Whether events wait for a bus, or are lost there: light between them tells of another time."""
+        return self.entry_of(FULL_BUS) is not None
 
     @property
     def effects(self) -> dict[str, str]:

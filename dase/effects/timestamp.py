@@ -25,8 +25,8 @@ from dase.effects.stream import (
 from dase.errors import InputError
 from dase.events import Events
 
-SMALL = 2e-5
-"""Errors of the stamps up to this are far below the steps in which statistics see time [s]."""
+LEAST_JITTER = 2e-5
+"""Errors of the stamps below this are far below the steps in which statistics see time [s]."""
 
 
 class Stamp(Reader):
@@ -114,11 +114,12 @@ class Timestamp(StreamEffect):
     @classmethod
     def candidates(cls, observed: Observations) -> list[Self]:
         """Return the clock that is seen in the time stamps; where none is, stamps that are off."""
+        # as large as that, for a search leaves out what is small beside its steps of time
         return [cls(step=observed.clock_period, jitter=0.0 if observed.clock_period else 1e-3)]
 
     def idle(self, beside: Sequence[Effect]) -> tuple[str, ...]:
         """Return the names of the parameters that change nothing, of errors too small for any statistic."""
-        return ("jitter",) if self.jitter < SMALL else ()
+        return ("jitter",) if self.jitter < LEAST_JITTER else ()
 
     def longest_delay(self, lines: int) -> float:
         """Return about how late it makes events [s]."""

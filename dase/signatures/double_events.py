@@ -17,7 +17,9 @@ fast rise as well. So it counts where hardly any is later, and hardly ever two i
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 import warp as wp
@@ -176,32 +178,52 @@ def find_double_events(
         return without_answer(
             DOUBLE_EVENTS, f"stamps are {format_seconds(tick)} apart, which hides what is sooner"
         )
-    if int(intervals.events[:, ~hot].sum()) * s.least < 20:
-        events = format_count(int(intervals.events[:, ~hot].sum()))
+    count = intervals.events.sum(0)
+    events = int(count[~hot].sum())
+    if events * s.least < 20:
         return without_answer(
-            DOUBLE_EVENTS, f"{events} events, too few for a share of {format_percent(s.least)}"
+            DOUBLE_EVENTS, f"{format_count(events)} events, too few for a share of {format_percent(s.least)}"
         )
-    soon = _look_within(intervals, 1, hot, level)
+    busy = float(np.quantile(count[~hot], s.bulk))
+    totals = [_Totals.of(intervals, some) for some in (~hot, ~hot & (count <= busy))]
+    soon = _look_within(intervals, 1, totals, level)
     if soon.found:
         return soon
     for reach in range(2, len(intervals.edges) - 1):
-        slow = _look_within(intervals, reach, hot, level)
+        slow = _look_within(intervals, reach, totals, level)
         if slow.found:
             return slow
     return soon
 
 
-def _look_within(intervals: IntervalCounts, reach: int, hot: NDArray[np.bool_], level: float) -> Signature:
-    """Look for doubles that are sooner than an edge, by its number; beyond 1 they are slow."""
+@dataclass(frozen=True)
+class _Totals:
+    """Of some pixels together: intervals as `IntervalCounts` has them, (3, K, 2), and events, (2,)."""
+
+    counts: NDArray[np.int64]
+    events: NDArray[np.int64]
+
+    @classmethod
+    def of(cls, intervals: IntervalCounts, some: NDArray[np.bool_]) -> Self:
+        """Return those of pixels, shape (H * W,)."""
+        return cls(intervals.counts[..., some].sum(-1), intervals.events[:, some].sum(1))
+
+
+def _look_within(intervals: IntervalCounts, reach: int, totals: Sequence[_Totals], level: float) -> Signature:
+    """Look for doubles that are sooner than an edge, by its number; beyond 1 they are slow.
+
+    Args:
+        intervals: Their edges and settings.
+        reach: Number of the edge.
+        totals: Of all pixels that are not hot, and without the busiest.
+        level: p below which they are there.
+    """
     s, edge = intervals.settings, float(intervals.edges[reach])
-    count = intervals.events.sum(0)
-    busy = float(np.quantile(count[~hot], s.bulk)) if np.any(~hot) else 0.0
-    every = intervals.counts[0][:, :, ~hot].sum((1, 2))
+    every, events = totals[0].counts[0].sum(1), int(totals[0].events.sum())
     ties, near, rest = int(every[0]), int(every[1 : reach + 1].sum()), int(every[reach + 1 :].sum())
-    events = int(count[~hot].sum())
     chance = edge / s.far
     looks = 1 + len(s.slow)
-    p = min(looks * max(_chance_of(intervals, reach, some) for some in (~hot, ~hot & (count <= busy))), 1.0)
+    p = min(looks * max(_chance_of(some, reach, chance, s) for some in totals), 1.0)
     low, high = (limit / events for limit in poisson_interval(near))
     share, within = near / events, format_seconds(edge)
     hidden = ", most of these where many pixels send at one time"
@@ -238,13 +260,11 @@ def _leave_the_clock(intervals: IntervalCounts, hot: NDArray[np.bool_]) -> bool:
     return enough and intervals.at_own_times <= s.off_clock * doubles
 
 
-def _chance_of(intervals: IntervalCounts, reach: int, some: NDArray[np.bool_]) -> float:
-    """Return p of the null for some pixels, shape (H * W,); 1 if there are too few doubles."""
-    s, chance = intervals.settings, float(intervals.edges[reach]) / intervals.settings.far
-    least = s.least * intervals.events[:, some].sum(1)
-    bins = intervals.counts[:, :, :, some].sum(3)
-    every, silent, calm = bins[:, 1 : reach + 1].sum(1)  # OFF and ON
-    later, _, calm_later = bins[:, reach + 1 :].sum(1)
+def _chance_of(some: _Totals, reach: int, chance: float, s: DoubleSettings) -> float:
+    """Return p of the null, by which so great a share is soon, for some pixels; 1 if too few are double."""
+    least = s.least * some.events
+    every, silent, calm = some.counts[:, 1 : reach + 1].sum(1)  # OFF and ON
+    later, _, calm_later = some.counts[:, reach + 1 :].sum(1)
     if reach > 1 and (later[0] > s.none_later * every[0] or silent[0] < s.alone * every[0]):
         return 1.0
     soon, rest = int(calm[0]), int(calm_later[0])

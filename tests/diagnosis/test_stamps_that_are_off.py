@@ -8,7 +8,7 @@ from helpers.frame_simulator import shaken_texture
 import dase
 from dase.diagnosis.diagnose import diagnose
 from dase.effects import EFFECTS
-from dase.effects.timestamp import SMALL, Timestamp
+from dase.effects.timestamp import LEAST_JITTER, Timestamp
 from dase.fitting.data_split import split_measurement
 from dase.fitting.measurement import Measurement
 from dase.results import Grade
@@ -26,7 +26,7 @@ def test_stamps_that_are_off_are_tried_where_no_clock_is_seen(scene):
     evidence = split_measurement(Measurement(dase.simulate(scene, Sensor(), seed=6), scene), pixels=100)
     (tried,) = Timestamp.candidates(evidence.observe(idle_bus=0.01))
     assert (tried.step, tried.idle(())) == (0.0, ())
-    assert Timestamp(jitter=0.9 * SMALL).idle(()) == ("jitter",)
+    assert Timestamp(jitter=0.9 * LEAST_JITTER).idle(()) == ("jitter",)
     slow = Sensor().with_effect(Timestamp(step=2e-3, jitter=0.0))
     evidence = split_measurement(Measurement(dase.simulate(scene, slow, seed=6), scene), pixels=100)
     (tried,) = Timestamp.candidates(evidence.observe(idle_bus=0.01))
