@@ -268,6 +268,13 @@ def peak_of(clock: NDArray[np.int64], step: float) -> RatePeak:
         return RatePeak(0.0, 1.0)
     above[~inside] = 0.0
     top = int(above.argmax())
+    # where all is quiet an overtone may stand as far above it as its stronger tone does where more goes on
+    for many in (2, 3):
+        tone = np.where(np.abs(many * frequency - frequency[top]) < 1.5 / (steps * step), above, 0.0)
+        lower = int(tone.argmax())
+        if tone[lower] > 0.5 * above[top] and power[lower] > power[top]:
+            top = lower
+            break
     # the top is chosen where the usual is low by chance as well: what it is compared with is wider
     around = power[max(top - 8 * 200, 0) : top + 8 * 200]
     # the power of independent events is exponential, with a median of log 2 means; padded, a maximum lies

@@ -57,6 +57,18 @@ def with_frames(events):
     return Sequence(events, frames, times + 0.005, frame_exposure=np.full(len(times), 0.01))
 
 
+@pytest.mark.parametrize("seed", [3, 4])
+def test_a_weak_lamp_is_found_in_less_than_a_second(seed):
+    """One that swings 0.1 of the rate keeps its phase for too few blocks of 50 ms to be told from chance."""
+    events = made(seed, flicker={"frequency": 120.0, "depth": 0.025})
+    short = events.select(events.t < 0.6)
+    entry = dase.find_signatures(short)["flicker"]
+    assert entry.found
+    assert entry.details["frequency"] == pytest.approx(120.0, abs=0.3)
+    plain = made(seed)
+    assert not dase.find_signatures(plain.select(plain.t < 0.6))["flicker"].found
+
+
 def test_a_plain_sensor_shows_nothing(plain):
     looked = dase.find_signatures(with_frames(plain))
     assert not looked.found
