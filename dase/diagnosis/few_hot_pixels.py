@@ -31,8 +31,8 @@ class HotPixelSettings:
     few: float = 3.0
     """Hot pixels that a part of the measurement would have in the mean, below which they are too few."""
 
-    side: float = 1.645
-    """Standard deviations on either side of a 90 % interval."""
+    side: float = 0.95
+    """Of Student's law up to which intervals of 90 % go: few pixels know how far they lie apart no better."""
 
 
 HOT_PIXELS = HotPixelSettings()
@@ -80,11 +80,12 @@ def hot_effect_of(
         return Estimate(*(float(np.clip(value, *facts[name].bounds)) for value in values))
 
     middle, spread = float(rates.mean()), float(rates.std(ddof=1))
-    off = settings.side * spread / np.sqrt(count)
+    side = float(stats.t.ppf(settings.side, count - 1))
+    off = side * spread / np.sqrt(count)
     # of normal logarithms, the spread follows a chi-squared law
     ends = spread * np.sqrt((count - 1) / stats.chi2.ppf([0.95, 0.05], count - 1))
     shares = on / np.maximum(sent, 1)
-    balance, beside = float(shares.mean()), settings.side * float(shares.std(ddof=1)) / np.sqrt(count)
+    balance, beside = float(shares.mean()), side * float(shares.std(ddof=1)) / np.sqrt(count)
     least, most = 0.5 * stats.chi2.ppf(0.05, 2 * count), 0.5 * stats.chi2.ppf(0.95, 2 * count + 2)
     found = {
         "share": estimate("share", count / size, least / size, most / size),

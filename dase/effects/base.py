@@ -392,6 +392,20 @@ class Effect:
         """
         return ()
 
+    def share_that_tells(self, name: str) -> float:
+        """Return the share of the pixels that tell a parameter, each by a value that chance has given it.
+
+        Where these are few, an interval is as wide as Student's law for as many.
+
+        Args:
+            name: Of the parameter.
+        """
+        return 1.0
+
+    def knows_samples_alone(self) -> bool:
+        """Whether this effect goes from one sample of a scene to the next, with nothing between them."""
+        return False
+
     def longest_step(self) -> float:
         """Return the longest time between samples that still shows the effect [s]."""
         return math.inf

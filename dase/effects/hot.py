@@ -118,6 +118,10 @@ class Hot(Effect):
         """Return noise: which of the two it is, the events of the few hot pixels tell without a search."""
         return [cls()]
 
+    def share_that_tells(self, name: str) -> float:
+        """Return the share of hot pixels for their median rate, which is that of as many logarithms."""
+        return self.share if name == "rate" else 1.0
+
     def compiled(self) -> EffectStages:
         """Return what the kernel composer needs to know: each mode acts at a stage of its own."""
         stage = ("drift", hot_drift) if self.mode == "leak" else ("noise", hot_rates)

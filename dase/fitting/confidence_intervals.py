@@ -6,10 +6,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import stats
 
 from dase.fitting.data_split import SplitMeasurement
 from dase.fitting.descent import DESCENT, denoised_normal_matrix, fit_slopes
 from dase.fitting.model import FittedModel, model_of
+from dase.fitting.parameter_space import SearchAxis
 from dase.fitting.subset import CalibratedSubset
 from dase.probes.random_streams import Draw, SimulationStream
 from dase.results import Estimate
@@ -124,10 +126,22 @@ def estimate_parameters(
         way = _steps_as_wide_as(_where_lines_are_straight(estimator, half, way), limit)
     out = {}
     for n, axis in enumerate(model.space.axes):
-        place, off = model.place[n], CONFIDENCE.side * deviation[n]
+        place, off = model.place[n], _side_of(model, axis, half) * deviation[n]
         ends = (float(axis.to_value(np.clip(place + way * off, low[n], high[n]))) for way in (-1, 1))
         out[axis.name] = Estimate(float(axis.to_value(place)), *ends)
     return model, out
+
+
+def _side_of(model: FittedModel, axis: SearchAxis, half: CalibratedSubset) -> float:
+    """Return how many standard deviations an interval has on either side.
+
+    How far a few values lie apart is known no better than their mean: without this, 75 % of intervals held
+    the median rate of some ten hot pixels.
+    """
+    effect, _, parameter = axis.name.partition(".")
+    share = model.sensor[effect].share_that_tells(parameter)
+    few = max(share * len(half.trials.stimulus.pixels), 2.0)
+    return float(CONFIDENCE.side * stats.t.ppf(0.95, few - 1.0) / stats.norm.ppf(0.95))
 
 
 def _with_observed_free(model: FittedModel) -> FittedModel:
