@@ -436,7 +436,7 @@ def try_effects(
     variants = [
         v for name in names for v in variants_to_try(evidence, effects[name], idle_bus=settings.idle_bus)
     ]
-    order, left = _screen_variants(evidence, present, variants, seed=seed, report=report, settings=settings)
+    order, left = screen_variants(evidence, present, variants, seed=seed, report=report, settings=settings)
     # two variants of an effect take the place of one
     names_of_first = list(dict.fromkeys(one.name for one in order))[: settings.finalists]
     first = [one for one in order if one.name in names_of_first]
@@ -496,7 +496,7 @@ def _refine_candidates(
     return [one for one in first if one not in rough] + refined(again, SAMPLES[-1]), behind
 
 
-def _screen_variants(
+def screen_variants(
     evidence: CalibratedSplit,
     present: FittedModel,
     variants: Sequence[Effect],
@@ -504,13 +504,26 @@ def _screen_variants(
     seed: int,
     report: StepProgress,
     settings: CandidateSettings,
+    goal: float = float("inf"),
 ) -> tuple[list[Candidate], list[Candidate]]:
-    """Return candidates in order of their loss on some pixels, and those from which nothing descended."""
+    """Return candidates in order of their loss on some pixels, and those from which nothing descended.
+
+    Args:
+        evidence: The measurement, calibrated.
+        present: The model so far.
+        variants: Effects at any strength.
+        seed: Of every random number.
+        report: Told how far it is.
+        settings: Numbers by which candidates are chosen.
+        goal: Loss above which a descent need not go on.
+    """
     screenings = run_side_by_side(
         [screen_effect(evidence, present, effect, seed=seed) for effect in variants],
         lambda share: report("looking at all effects", 0.2 * share),
     )
-    race, found = CandidateRace(settings.finalists), dict[tuple[str, int], Candidate]()
+    unit = max((one.present_loss for one in screenings), default=1.0)
+    race = CandidateRace(settings.finalists, goal=goal / unit)
+    found = dict[tuple[str, int], Candidate]()
     step = evidence.train.frame.step
     most = samples_of_screening(present.sensor, step)
     works = [

@@ -337,7 +337,7 @@ def _equally_good_rivals(
     found: Sequence[str],
     doubtful: Collection[str],
 ) -> dict[str, tuple[str, ...]]:
-    """Return for each effect those that do nearly as well in its place, the rest fitted again.
+    """Return for each effect those that do nearly as well in its place, all else fitted again, best first.
 
     Args:
         task: What the diagnosis is asked.
@@ -352,7 +352,7 @@ def _equally_good_rivals(
         for other in _rivals_to_try(task, path, model, name, doubtful=name in doubtful):
             sensor = model.sensor.without(name).with_effect(other.model.sensor[other.name])
             asked.append((name, other.name, with_same_freedom(sensor, model, [other.name])))
-    out: dict[str, list[str]] = {name: [] for name in found}
+    out: dict[str, list[tuple[float, str]]] = {name: [] for name in found}
     if asked:
         # one that will not come near the model in its fit is none; the slowest take longer than all else
         race = CandidateRace(1, settings.rival_loses, best={"": model.loss})
@@ -372,5 +372,5 @@ def _equally_good_rivals(
             level = max(mine.level, settings.usual)
             left = max(mine.error - level, 0.0)
             if judged.error - level <= max(settings.tie_share * left, left + settings.tie):
-                out[name].append(other_name)
-    return {name: tuple(others) for name, others in out.items()}
+                out[name].append((judged.error, other_name))
+    return {name: tuple(other for _, other in sorted(others)) for name, others in out.items()}

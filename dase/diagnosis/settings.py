@@ -133,6 +133,17 @@ class PruningSettings:
 
 
 @dataclass(frozen=True)
+class ExchangeSettings:
+    """When another effect is tried in the place of one that was found beside others."""
+
+    near: float = 1.5
+    """Only those whose loss on the scout comes below this, in units of the model's own."""
+
+    fitted: int = 3
+    """Effects that are fitted to all pixels in the place of another, at most."""
+
+
+@dataclass(frozen=True)
 class GradeSettings:
     """How sure a diagnosis must be of an effect.
 
@@ -335,6 +346,7 @@ class DiagnosisSettings:
     candidates: CandidateSettings = field(default_factory=CandidateSettings)
     hidden: HiddenEffectSettings = field(default_factory=HiddenEffectSettings)
     pruning: PruningSettings = field(default_factory=PruningSettings)
+    exchange: ExchangeSettings = field(default_factory=ExchangeSettings)
     grades: GradeSettings = field(default_factory=GradeSettings)
     detection: DetectionSettings = field(default_factory=DetectionSettings)
 

@@ -228,6 +228,21 @@ class DiagnosisState:
             without={**path.without, name: without} if reaches_floor(without) else path.without,
         )
 
+    def note_rivals(self, name: str, finalists: Sequence[Candidate], judgement: Judgement) -> None:
+        """Keep what does nearly as well as an effect beside all others of the last model.
+
+        Args:
+            name: Of the effect.
+            finalists: Candidates that were judged in its place.
+            judgement: The held-out error with it.
+        """
+        path = self.path
+        self.path = replace(
+            path,
+            alternatives={**path.alternatives, name: finalists},
+            error_of={**path.error_of, name: judgement.error},
+        )
+
     def leave_at_first_step(self) -> None:
         """Leave the path at the first step in which all effects were tried, before it added any.
 
