@@ -21,6 +21,7 @@ from dase.diagnosis.direct_readings import (
 )
 from dase.diagnosis.effect_search import search_effects
 from dase.diagnosis.few_hot_pixels import hot_effect_of, with_hot_pixels
+from dase.diagnosis.frame_memory import with_memory_of_frames
 from dase.diagnosis.held_frames import (
     held_behind_low_pass,
     with_frame_as_memory,
@@ -194,11 +195,13 @@ def _begin_search(
     bare = put_in_step(compared.given, evidence)
     free = free_where_measured(evidence, bare, free)
     given = with_frame_as_memory(bare, compared.measurement, evidence, free, seed=compared.seed)
+    if given is not bare and JITTER in effects:
+        given = with_drawn_thresholds(given, compared.measurement)
+    given, more = with_memory_of_frames(given, compared.measurement, evidence, free, seed=compared.seed)
+    notes += more
     if given is not bare:
-        # how often a held frame makes pixels send is counted, and no fit tells it better
+        # how often a held frame makes pixels send is counted, and what they forget is known, not fitted
         free = [axis.name for axis in axes_of(bare, free)]
-        if JITTER in effects:
-            given = with_drawn_thresholds(given, compared.measurement)
     tell("fitting the present model", 0.0, float("nan"))
     task = DiagnosisTask(
         evidence, compared.candidates(effects), compared.seed, tell,

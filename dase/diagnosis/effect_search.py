@@ -25,6 +25,8 @@ from dase.diagnosis.compared_measurement import ComparedMeasurement
 from dase.diagnosis.dead_time import EFFECT as REFRACTORY
 from dase.diagnosis.directional_test import find_hidden_effect
 from dase.diagnosis.effect_pairs import add_pair
+from dase.diagnosis.exchange import exchange_effects
+from dase.diagnosis.frame_memory import forgets_at_frames
 from dase.diagnosis.held_frames import known_at_frames_alone, low_pass_of
 from dase.diagnosis.pruning import prune_model
 from dase.diagnosis.ranking import rank_of
@@ -64,6 +66,8 @@ def search_effects(
     # what is not of this scene has no effects to be found
     most = 0 if state.task.evidence.contradiction else most
     model, judgement = _add_one_by_one(state, compared, start, most, asks=state.task.settings.frames_asked)
+    if most > 0 and state.other_scene is None:
+        state.other_scene = forgets_at_frames(state.task, state.path, compared.measurement, model, judgement)
     if state.other_scene is not None:
         return model, judgement
     if most > 0 and not state.task.all_time and _shows_later_alone(state.task, model, judgement):
@@ -93,6 +97,7 @@ def search_effects(
         if model is not whole and not leaves_nothing(judgement) and not state.path.has_asked(model):
             # a stand-in that was dropped may have hidden what it stood for
             model, judgement = _add_one_by_one(state, compared, model, _left_to_add(task, model, most))
+    model, judgement = exchange_effects(state, model, judgement)
     model, judgement = _fit_beyond_the_search(task, model, judgement)
     state.other_scene = _known_at_frames(state, compared, model, judgement)
     return model, judgement

@@ -135,7 +135,7 @@ def with_frame_as_memory(
         for frames in fewest
         if frames
     ]
-    error = partial(_error_of, evidence, seed=seed, settings=settings)
+    error = partial(error_once_fitted, evidence, seed=seed, settings=settings)
     errors = [error(one, sensor, free) for one in waits]
     begin, _ = begin_of_events(_phases(measurement))
     if begin is not None and begin > settings.at_once:
@@ -164,14 +164,14 @@ def _slow(sensor: Sensor, gap: float) -> Sensor:
     return sensor if Bandwidth.name in sensor else sensor.with_effect(Bandwidth(cutoff=0.5 / gap))
 
 
-def _error_of(
+def error_once_fitted(
     evidence: SplitMeasurement,
     sensor: Sensor,
     varied: Sensor,
     free: Sequence[str] | None,
     *,
     seed: int,
-    settings: HeldFrameSettings,
+    settings: HeldFrameSettings = HELD_FRAMES,
 ) -> float:
     """Return the error of a sensor that was fitted, of the part that chooses.
 
@@ -218,7 +218,7 @@ def held_behind_low_pass(
     before = start.judge(evidence.held, repeats=settings.repeats, seed=stream).error
     if before < settings.missing:
         return None
-    error = partial(_error_of, seed=seed, settings=settings)
+    error = partial(error_once_fitted, seed=seed, settings=settings)
     slow = _slow(start.sensor, scene.longest_gap())
     straight = error(evidence, slow, slow, None)
     if straight > settings.slow * before:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from typing import ClassVar, Self
 
 import warp as wp
 
-from dase.effects.base import Effect, choice, parameter
+from dase.effects.base import ANY_SAMPLES, Effect, Observations, choice, parameter
 from dase.kernels.pixel_stages import REST, EffectStages
 from dase.kernels.vector_math import exponential
 
@@ -42,6 +43,46 @@ def fading_change(
     return passed, voltage, passed
 
 
+@wp.func
+def change_from_frame(
+    voltage: float, dt: float, signal: float, before: float, cutoff: float, input: float, output: float
+):
+    """A voltage of which the step of the last sample is whole, and what was there before that has faded."""
+    memory = signal - before
+    kept = wp.where(cutoff == 0.0, 1.0, exponential(-2.0 * wp.pi * cutoff * dt))
+    passed = memory + (output - memory) * kept + voltage - input
+    passed = wp.where(dt >= REST, voltage, passed)
+    if cutoff == 0.0:
+        passed = voltage  # sums of differences would round
+    return passed, voltage, passed
+
+
+@wp.func
+def change_since_sending(
+    voltage: float,
+    dt: float,
+    signal: float,
+    before: float,
+    cutoff: float,
+    input: float,
+    output: float,
+    memory: float,
+):
+    """The same, where fades what is left to a pixel that has sent since the sample before."""
+    now = signal - before
+    has_sent = wp.abs(now - memory) > 1.0e-4  # no threshold is as small
+    kept = wp.where(has_sent, exponential(-2.0 * wp.pi * cutoff * dt), 1.0)
+    passed = now + (output - now) * kept + voltage - input
+    passed = wp.where(dt >= REST, voltage, passed)
+    if cutoff == 0.0:
+        passed = voltage
+    return passed, voltage, passed, now
+
+
+CHANGES_OF_FRAMES = {"frames": change_from_frame, "sending frames": change_since_sending}
+CHANGES = {"memory": fading_change, **CHANGES_OF_FRAMES}
+
+
 @dataclass(frozen=True, kw_only=True)
 class HighPass(Effect):
     """Slow changes are forgotten before they make events.
@@ -62,13 +103,21 @@ class HighPass(Effect):
     -log(1 - 2π cutoff threshold / s) / (2π cutoff), and none below s = 2π cutoff threshold. A leak, which
     moves the memory at a speed of its own, sends nothing either if it is as slow. What Prophesee's pixel does
     is not published; other simulators have the one or the other.
+
+    Simulators that know the light at the frames of a clip alone forget from frame to frame, which is what the
+    last two do from sample to sample of such a clip: what a frame changes is whole, and of what was left
+    before that a share of exp(-2π cutoff T) stays, T being the time between two. At the highest cutoff
+    nothing stays. With `"frames"` each frame is then compared with the one before alone (AirSim); with
+    `"sending frames"` a pixel that has sent takes the light of its frame for its memory, and one that has not
+    goes on (PIX2NVS). They are no property of a camera.
     """
 
     name: ClassVar[str] = "high_pass"
     unbroken: ClassVar[bool] = True
     source: ClassVar[str] = (
         "Finateu et al.: A 1280x720 back-illuminated stacked temporal contrast event-based vision sensor "
-        "with 4.86 um pixels, 2020; Prophesee: Metavision documentation, biases (bias_hpf), 2024"
+        "with 4.86 um pixels, 2020; Prophesee: Metavision documentation, biases (bias_hpf), 2024; frames: "
+        "Shah et al.: AirSim, 2017; Bi, Andreopoulos: PIX2NVS, 2017"
     )
     stages: ClassVar = {"respond": highpass}
     states: ClassVar = ("input", "output")
@@ -84,11 +133,27 @@ class HighPass(Effect):
     )
     at: str = choice(
         "input",
-        among=("input", "memory"),
-        about="what fades: the input of the change detector, or the change since its last event",
+        among=("input", "memory", "frames", "sending frames"),
+        about="what fades: the input of the change detector, or the change since its last event, or what is "
+        "left of that from one frame of a clip to the next",
     )
+
+    @classmethod
+    def candidates(cls, observed: Observations) -> list[Self]:
+        """Return what a camera may have; what a simulator forgets from frame to frame is no effect."""
+        return [cls(at="input"), cls(at="memory")]
+
+    def knows_samples_alone(self) -> bool:
+        """Whether it forgets from one sample of the scene to the next."""
+        return self.at in CHANGES_OF_FRAMES and self.cutoff > 0.0
+
+    def longest_step(self) -> float:
+        """Return the longest time between samples that still shows the effect [s]."""
+        return ANY_SAMPLES if self.knows_samples_alone() else math.inf
 
     def compiled(self) -> EffectStages:
         """Return what the kernel composer needs to know: each place has a function of its own."""
-        respond = highpass if self.at == "input" else fading_change
-        return replace(super().compiled(), functions=(("respond", respond),))
+        respond, states = CHANGES.get(self.at, highpass), self.states
+        if self.at == "sending frames":
+            states = (*states, "memory")
+        return replace(super().compiled(), functions=(("respond", respond),), states=states)

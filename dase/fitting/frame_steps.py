@@ -10,6 +10,7 @@ and such a simulator says what went on since the last frame at the next one or a
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -68,8 +69,44 @@ class FrameStepSettings:
     near: float = 0.02
     """How far from a frame an event is of it, in steps from frame to frame."""
 
+    elsewhere: float = 0.01
+    """Share of the events at other times than frames from which on it is asked whether those at a frame tell
+    of what comes after it: a clock whose ticks are frames has none."""
+
+    in_the_middle: float = 0.05
+    """Share of these that come in the middle between two frames: a simulator that holds frames sends nothing
+    there, and what comes at any time is there by a chance of 0.002."""
+
+    exact: float = 1.5e-6
+    """How far from a frame an event is stamped with its time [s]."""
+
+    many: float = 0.3
+    """Share of the events that are stamped with times of frames, from which on the others may come at any
+    time: hot pixels and noise beside a simulator by frames, or parts of frames of many lengths."""
+
+    astray: float = 0.15
+    """Share of these that may go against the light; of noise that is drawn once a frame half do."""
+
+    clearly: float = 0.3
+    """Events at a frame that go against the light after it, relative to those that go against the light
+    before it, below which all are of what comes after it."""
+
 
 FRAME_STEPS = FrameStepSettings()
+
+
+class AgainstLight(NamedTuple):
+    """How many events at frames go against the light.
+
+    Args:
+        events: At the frames that were looked at.
+        before: Those against the light from the frame before on.
+        after: Those against the light up to the next frame.
+    """
+
+    events: int
+    before: int
+    after: int
 
 
 def frame_step_of(events: Events, scene: Scene, settings: FrameStepSettings = FRAME_STEPS) -> float | None:
@@ -93,6 +130,8 @@ def frame_step_of(events: Events, scene: Scene, settings: FrameStepSettings = FR
         return None
     microseconds = max(1e6 * float(t[-1] - t[0]), 1.0)
     anywhere = microseconds * -np.expm1(-len(t) / microseconds)
+    if _come_at_frames(events, scene, step, settings):
+        return step
     if 1 + np.count_nonzero(np.diff(np.round(1e6 * t))) > settings.distinct * anywhere:
         return None
     phase = ((t - times[0]) / step) % 1.0
@@ -107,6 +146,21 @@ def frame_step_of(events: Events, scene: Scene, settings: FrameStepSettings = FR
         few and (uneven or _in_turn(events, times[0], step) > settings.follow)
     )
     return step if emptiest < settings.empty and in_step else None
+
+
+def _come_at_frames(events: Events, scene: Scene, step: float, settings: FrameStepSettings) -> bool:
+    """Whether many events are stamped with times of frames, and go with the light before or after these."""
+    begin = scene.frame_times()[0] if isinstance(scene, VideoScene) else scene.sample_times()[0]
+    phase = ((events.t - begin) / step + 0.5) % 1.0 - 0.5
+    at_frame = np.abs(phase) * step < settings.exact
+    if at_frame.mean() < settings.many:
+        return False
+    # ticks of a clock have all alike
+    others = np.histogram(phase[~at_frame] % 1.0, 2 * settings.parts, (0.0, 1.0))[0]
+    if others.max() * settings.most > np.count_nonzero(at_frame):
+        return False
+    against = _against_the_light(events.select(at_frame), scene, step, settings)
+    return min(against.before, against.after) < settings.astray * against.events
 
 
 def _in_turn(events: Events, begin: float, step: float, most: int = 300_000) -> float:
@@ -164,17 +218,53 @@ def ticks_are_of_frames(
         return False
     if tick < (1 - settings.near) * frame_step:
         return True
+    against = _against_the_light(events, scene, frame_step, settings)
+    return against.before < against.after
+
+
+def comes_before_its_light(
+    events: Events, scene: Scene, settings: FrameStepSettings = FRAME_STEPS
+) -> float | None:
+    """Return the time from frame to frame if events at a frame tell of what comes after it [s], else None.
+
+    A simulator by frames may give the events of a frame times from that of the one before on (AirSim): those
+    that it sends first are stamped with the time at which their light begins to change.
+
+    Args:
+        events: Sorted.
+        scene: What they are of.
+        settings: When they do.
+    """
+    step = frame_step_of(events, scene, settings)
+    if step is None or (isinstance(scene, VideoScene) and scene.by_frames):
+        return None
+    phase = (events.t - scene.sample_times()[0]) / step % 1.0
+    late = np.minimum(phase, 1.0 - phase) * step
+    others = phase[late > settings.exact]
+    if len(others) < settings.elsewhere * len(events):
+        return None
+    if np.mean(np.abs(others - 0.5) * step < settings.exact) < settings.in_the_middle:
+        return None
+    against = _against_the_light(events, scene, step, settings)
+    return step if against.after < settings.clearly * against.before else None
+
+
+def _against_the_light(
+    events: Events, scene: Scene, frame_step: float, settings: FrameStepSettings
+) -> AgainstLight:
+    """Return how many events at some of the frames go against the light."""
     times = scene.sample_times()
     inner = np.unique(np.linspace(1, len(times) - 2, settings.looked).astype(int))
-    before = after = 0
+    before = after = count = 0
     for at in inner if len(times) > 2 else ():
         first, last = np.searchsorted(events.t, times[at] + np.array([-1, 1]) * settings.near * frame_step)
         y, x = events.y[first:last], events.x[first:last]
         light = scene.frames(times[at - 1 : at + 2])[:, y, x]
         ways = np.where(events.p[first:last], 1, -1) * np.sign(np.diff(light, axis=0))
-        before += int(np.count_nonzero(ways[0] > 0))
-        after += int(np.count_nonzero(ways[1] > 0))
-    return before > after
+        count += int(last - first)
+        before += int(np.count_nonzero(ways[0] <= 0))
+        after += int(np.count_nonzero(ways[1] <= 0))
+    return AgainstLight(count, before, after)
 
 
 def is_held(scene: Scene) -> bool:

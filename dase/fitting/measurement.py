@@ -19,6 +19,7 @@ from dase import io
 from dase.effects.optics_blur import OpticsBlur, blur_weights
 from dase.errors import InputError
 from dase.events import Events
+from dase.fitting.frame_steps import comes_before_its_light
 from dase.fitting.held_clips import holds_frames
 from dase.fitting.screen_alignment import screen_scene
 from dase.formatting import fit_to_screen, format_seconds
@@ -187,7 +188,12 @@ def as_measurement(
 def _as_shown(measurement: Measurement) -> Measurement:
     """Return a measurement with its clip at the times at which its frames were shown, by the events."""
     scene = measurement.scene
-    if not isinstance(scene, VideoScene) or not holds_frames(measurement.events, scene):
+    if not isinstance(scene, VideoScene) or scene.early or scene.forgets:
+        return measurement
+    step = comes_before_its_light(measurement.events, scene)
+    if step is not None:
+        return replace(measurement, scene=scene.begun_early(step))
+    if not holds_frames(measurement.events, scene):
         return measurement
     shown = scene.held(STIMULUS.common_step)
     return replace(measurement, scene=shown, notes=(*measurement.notes, note_of_held_frames(shown)))

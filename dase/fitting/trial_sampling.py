@@ -31,6 +31,8 @@ def samples_per_step(sensor: Sensor, step: float) -> int:
         sensor: The model.
         step: Of the grid [s].
     """
+    if sensor.knows_samples_alone:
+        return 1
     return _at_least(max(_wanted(effect, step) for effect in sensor.effects))
 
 
@@ -55,6 +57,8 @@ def samples_per_step_of_rows(sensor: Sensor, vectors: NDArray[Any], step: float)
         vectors: Parameters of the models, shape (B, P).
         step: Of the grid [s].
     """
+    if sensor.knows_samples_alone:
+        return np.ones(len(vectors), np.int64)
     names = sensor.parameter_names()
     # most effects are seen as well at any sampling
     asking = [e for e in sensor.effects if type(e).longest_step is not Effect.longest_step]

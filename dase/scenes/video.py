@@ -133,6 +133,9 @@ class BlurredFrames:
 EARLY = 5e-6
 """Begin of a held frame's light before its time [s]: what comes at once is stamped with that time."""
 
+EARLY_SHARE = 0.01
+"""The same of light that goes straight from frame to frame, as a share of the time from one to the next."""
+
 Frames = NDArray[Any] | FrameReader | FilteredFrames | RepeatedFrames | BlurredFrames
 """What a `VideoScene` takes frames from, shape (F, height, width)."""
 
@@ -160,6 +163,12 @@ class VideoScene(Scene):
 
     by_frames = False
     """Whether a simulator has filtered light from frame to frame, and knows none between them."""
+
+    forgets = ""
+    """What a simulator forgets from frame to frame: where `HighPass.at` says so, or nothing."""
+
+    early = 0.0
+    """By how much it is earlier than the times that are written beside its frames [s]."""
 
     sharp: VideoScene | None = None
     """The clip as it is, where this is what a lens makes of it."""
@@ -210,7 +219,32 @@ class VideoScene(Scene):
 
     def frame_times(self) -> NDArray[np.float64]:
         """Return the times that are written beside the frames [s], whether they are held or not."""
-        return self._times[:: self.parts] + EARLY if self.held_for else self._times
+        return self._times[:: self.parts] + EARLY if self.held_for else self._times + self.early
+
+    def forgetting(self, at: str) -> VideoScene:
+        """Return the clip as a simulator sees it whose pixels forget from frame to frame.
+
+        Args:
+            at: What they forget, see `HighPass`.
+        """
+        out = copy(self)
+        out.forgets = at
+        out.sharp = self.sharp and self.sharp.forgetting(at)
+        return out
+
+    def begun_early(self, step: float) -> VideoScene:
+        """Return the clip a little earlier, for events that are stamped with the time their light begins at.
+
+        Args:
+            step: From frame to frame [s].
+        """
+        if self.early:
+            return self
+        out = copy(self)
+        out.early = EARLY_SHARE * step
+        out._times = self._times - out.early
+        out.sharp = self.sharp and self.sharp.begun_early(step)
+        return out
 
     def known_at_frames(self) -> VideoScene:
         """Return the light as a simulator takes it that knows the frames alone."""
@@ -256,6 +290,7 @@ class VideoScene(Scene):
             frames = BlurredFrames(self._frames, self.gamma, weights)
         out = VideoScene(frames, self._times)
         out.held_for, out.parts, out.by_frames = self.held_for, self.parts, self.by_frames
+        out.early, out.forgets = self.early, self.forgets
         out.sharp, out._lens_weights = self, weights
         return out
 

@@ -11,7 +11,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 from dase.effects import EFFECTS
-from dase.effects.base import Effect
+from dase.effects.base import ANY_SAMPLES, Effect
 from dase.effects.optics import SceneEffect
 from dase.effects.stream import StreamEffect
 from dase.effects.threshold import Threshold
@@ -110,8 +110,18 @@ class Sensor:
         return any(effect.unbroken for effect in self.effects)
 
     def longest_step(self) -> float:
-        """Return the longest time between samples that still shows all effects [s]."""
+        """Return the longest time between samples that still shows all effects [s].
+
+        Where a simulator by frames forgets from one to the next, nothing of it goes on between them.
+        """
+        if self.knows_samples_alone:
+            return ANY_SAMPLES
         return min(effect.longest_step() for effect in self.effects)
+
+    @property
+    def knows_samples_alone(self) -> bool:
+        """Whether some effect knows the samples of a scene alone, see `Effect.knows_samples_alone`."""
+        return any(effect.knows_samples_alone() for effect in self.effects)
 
     def stages(self) -> tuple[pixel_stages.EffectStages, ...]:
         """Return the pixels' effects as the kernel composer sees them; the threshold is part of its core."""

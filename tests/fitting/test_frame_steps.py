@@ -10,15 +10,22 @@ import pytest
 import dase
 from dase.diagnosis import seen_effects
 from dase.diagnosis.seen_effects import find_seen_effects
-from dase.effects import EFFECTS
+from dase.effects import EFFECTS, HighPass
 from dase.fitting import compared_time
 from dase.fitting.data_split import split_measurement
-from dase.fitting.frame_steps import clip_step_of, frame_step_of, is_in_step, ticks_are_of_frames
-from dase.fitting.measurement import Measurement, static_scene
+from dase.fitting.frame_steps import (
+    clip_step_of,
+    comes_before_its_light,
+    frame_step_of,
+    is_in_step,
+    ticks_are_of_frames,
+)
+from dase.fitting.measurement import Measurement, as_measurement, static_scene
 from dase.probes.timestamp_patterns import find_structure
 from dase.scenes.video import VideoScene
 from dase.signatures.result import Answer, Signature
 from dase.simulation.sensor import Sensor
+from tests.helpers.frame_simulator import bright_texture, counted_between_frames
 
 STEP, SIZE = 0.01, (40, 50)
 
@@ -32,8 +39,14 @@ def clip() -> VideoScene:
     return VideoScene((light / light.max()).astype(np.float32), np.arange(120) * STEP)
 
 
-def frame_by_frame(clip: VideoScene, theta: float = 0.1) -> dase.Events:
-    """Return events as v2e makes them: whole thresholds from frame to frame, at times that pixels share."""
+def frame_by_frame(clip: VideoScene, theta: float = 0.1, *, forgets: str = "") -> dase.Events:
+    """Return events as v2e makes them: whole thresholds from frame to frame, at times that pixels share.
+
+    Args:
+        clip: The frames.
+        theta: Threshold.
+        forgets: Where pixels take the light of a frame for their memory, as in `HighPass.at`.
+    """
     times = clip.sample_times()
     level = np.log(clip.frames(times).astype(float) + 1e-3)
     memory, rows = level[0].copy(), []
@@ -46,6 +59,8 @@ def frame_by_frame(clip: VideoScene, theta: float = 0.1) -> dase.Events:
             when = np.full(len(y), times[k - 1] + STEP * (n + 1) / most)
             rows.append(np.stack([when, x, y, count[y, x] > 0], 1))
         memory += count * theta
+        taken = {"": False, "frames": True, "sending frames": count != 0}[forgets]
+        memory = np.where(taken, level[k], memory)
     t, x, y, p = np.concatenate(rows).T
     return dase.Events(t, x.astype(np.uint16), y.astype(np.uint16), p.astype(bool), SIZE[1], SIZE[0])
 
@@ -56,6 +71,45 @@ def test_events_of_a_simulator_that_knows_frames_alone_are_compared_from_frame_t
     found = split_measurement(Measurement(events, clip), pixels=300, seed=1)
     assert np.diff(found.when).mean() == pytest.approx(STEP)
     assert any("in step with the frames" in note for note in found.notes)
+
+
+def counts_of_frames(events: dase.Events, clip: VideoScene) -> np.ndarray:
+    """Return OFF and ON events of each pixel from frame to frame, shape (F, height, width, 2)."""
+    frame = np.ceil((events.t - clip.sample_times()[0]) / STEP - 1e-6).astype(int)
+    out = np.zeros((len(clip.sample_times()), *SIZE, 2), int)
+    np.add.at(out, (frame, events.y, events.x, events.p.astype(int)), 1)
+    return out
+
+
+@pytest.mark.parametrize("forgets", ["frames", "sending frames"])
+def test_what_other_simulators_forget_from_frame_to_frame_is_simulated_exactly(clip, device, forgets):
+    """A threshold that is hit to a rounding error is the only difference."""
+    model = dase.Sensor().with_effect(EFFECTS["threshold"](on=0.1, off=0.1, phase=0.0))
+    model = model.with_effect(HighPass(at=forgets, cutoff=1e5))
+    mine = counts_of_frames(dase.simulate(clip, model, seed=1, device=device), clip)
+    theirs = counts_of_frames(frame_by_frame(clip, forgets=forgets), clip)
+    assert theirs.sum() > 10_000
+    assert np.abs(mine - theirs).sum() < 1e-4 * theirs.sum()
+    on = counts_of_frames(frame_by_frame(clip), clip)
+    assert np.abs(on - theirs).sum() > 0.1 * theirs.sum()
+
+
+@pytest.mark.parametrize("hot", [0, 40])
+def test_events_that_are_stamped_with_the_frame_before_are_of_the_light_after_it(hot):
+    """AirSim's; taken for the light before it, a clip without any effect ended at an error of 10."""
+    clip = bright_texture(STEP)
+    events = counted_between_frames(clip, 0.0, forgets="frames", hot=hot)
+    assert comes_before_its_light(events, clip) == pytest.approx(STEP)
+    shown = as_measurement(events, clip).scene
+    assert isinstance(shown, VideoScene)
+    assert shown.sample_times()[0] == pytest.approx(-0.01 * STEP)
+    assert shown.frame_times()[0] == pytest.approx(0.0)
+    assert frame_step_of(events, shown) == pytest.approx(STEP)
+    assert as_measurement(events, shown).scene is shown
+    halves = Sensor().with_effect(EFFECTS["timestamp"](step=STEP / 2))
+    others = [dase.simulate(clip, sensor, seed=2) for sensor in ("ideal", halves)]
+    others += [counted_between_frames(clip, 0.0, forgets=way, hot=hot) for way in ("", "sending frames")]
+    assert [comes_before_its_light(other, clip) for other in others] == [None] * 4
 
 
 def test_events_at_few_parts_of_a_frame_are_in_step_with_it_unless_these_are_alike(clip):

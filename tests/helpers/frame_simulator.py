@@ -33,6 +33,13 @@ def shaken_texture(seed: int = 0, gap: float = 2e-3, length: float = 0.8) -> Vid
     return VideoScene((255 * np.clip(light / np.quantile(light, 0.99), 0.02, 1)).astype(np.uint8), times)
 
 
+def bright_texture(gap: float, length: float = 1.2) -> VideoScene:
+    """Return that texture nowhere so dark that a simulator is linear there."""
+    scene = shaken_texture(gap=gap, length=length)
+    light = scene.frames(scene.sample_times())
+    return VideoScene(np.round(255 * (0.1 + 0.9 * light)).astype(np.uint8), scene.sample_times())
+
+
 def counted_between_frames(
     scene: VideoScene,
     spread: float,
@@ -41,6 +48,8 @@ def counted_between_frames(
     seed: int = 0,
     same: bool = False,
     shot: float = 0.0,
+    forgets: str = "",
+    hot: int = 0,
 ) -> Events:
     """Return events as a simulator of frames sends them: evenly between two, linear in the dark.
 
@@ -51,6 +60,9 @@ def counted_between_frames(
         seed: Of the random numbers.
         same: Whether each pixel has one threshold for both polarities.
         shot: Rate of noise of either polarity that no memory knows of [Hz].
+        forgets: Where pixels take the light of a frame for their memory, as in `HighPass.at`; for `"frames"`
+            times begin with that of the frame before.
+        hot: Pixels that send 400 ON events a second beside, which no memory knows of.
     """
     rng = np.random.default_rng(seed)
     times = scene.sample_times()
@@ -67,8 +79,15 @@ def counted_between_frames(
             for n in range(count.max(initial=0)):
                 y, x = np.nonzero(count > n)
                 t = begin + (end - begin) * (n + 1) / (count[y, x] + 1)
+                if forgets == "frames":
+                    t = begin + (end - begin) * n / count[y, x]
                 out.append((t, x, y, np.full(len(x), sign > 0)))
             memory += sign * count * threshold
+            memory = np.where((count > 0) & (forgets == "sending frames"), now, memory)
+        memory = now.copy() if forgets == "frames" else memory
+    for place in rng.choice(WIDTH * HEIGHT, hot, replace=False):
+        t = np.sort(rng.uniform(0, times[-1], rng.poisson(400 * times[-1])))
+        out.append((t, *(np.full(len(t), at) for at in (place % WIDTH, place // WIDTH, True))))
     many = rng.poisson(shot * times[-1] * WIDTH * HEIGHT)
     noise = [rng.integers(0, size, many) for size in (WIDTH, HEIGHT, 2)]
     out.append((rng.uniform(0, times[-1], many), noise[0], noise[1], noise[2] > 0))
