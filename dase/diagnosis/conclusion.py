@@ -65,8 +65,9 @@ def conclude_diagnosis(
     judged_effects: dict[str, Finding] = {}
     if not task.evidence.contradiction:
         judged_effects = grade_effects(
-            task, path, model, order, way, first, last, report=report, values=values, at_bounds=at_bounds
-        )
+            task, path, model, order, way, first, last, report=report, values=values, at_bounds=at_bounds,
+            complete=not seen.of_no_effect,
+        )  # fmt: skip
         seen_through = with_lens(model.sensor, task.lens)
         judged_effects = doubt_delays_within_frames(judged_effects, seen_through, measurement.scene)
     explained = model.sensor

@@ -15,6 +15,7 @@ from scipy import stats
 
 from dase.diagnosis.light_between_events import LightBetweenEvents, LightSteps
 from dase.effects.leak import Leak
+from dase.effects.timestamp import Timestamp
 from dase.errors import InputError
 from dase.probes.random_streams import SimulationStream
 from dase.probes.timestamp_patterns import TimestampStructure
@@ -134,6 +135,9 @@ def find_drifting_memory(
     if seen is None or not seen.is_leak(settings):
         return None
     without = sensor.without(EFFECT) if EFFECT in sensor else sensor
+    if structure.step and not structure.line and Timestamp.name not in without:
+        # light goes on until a tick of the clock, whether a library has it or not
+        without = without.with_effect(Timestamp(step=structure.step))
     try:
         made = light.of_model(without, seed=SimulationStream.DRIFTING_MEMORY.seed(seed))
     except InputError:

@@ -75,6 +75,7 @@ def grade_effects(
     report: CalibratedSubset,
     values: Mapping[str, Estimate],
     at_bounds: Sequence[str],
+    complete: bool = True,
 ) -> dict[str, Finding]:
     """Return what is to be said of each effect that a search has added.
 
@@ -89,6 +90,8 @@ def grade_effects(
         report: That part, with `model` as its present one.
         values: Estimates of its parameters.
         at_bounds: Sentences on parameters that ended where their search does.
+        complete: Whether the library has what the events show: else what is left of a large error may be most
+            of what the effect stands in for.
     """
     if not found:
         return {}
@@ -113,8 +116,9 @@ def grade_effects(
     def graded(name: str, has_rivals: bool) -> tuple[Grade, bool]:
         bare = without[name].judgement
         return grade_of(
-            start.judgement, bare, last, deviations[name], has_rivals=has_rivals, settings=settings
-        )
+            start.judgement, bare, last, deviations[name], has_rivals=has_rivals, complete=complete,
+            settings=settings,
+        )  # fmt: skip
 
     step = float(np.median(np.diff(task.evidence.when)))
     shortest = max(settings.shortest_time * step, task.frame_held)
@@ -245,6 +249,7 @@ def grade_of(
     deviation: float,
     *,
     has_rivals: bool,
+    complete: bool = True,
     settings: GradeSettings,
 ) -> tuple[Grade, bool]:
     """Return the grade of an effect, and whether something unknown may look like it.
@@ -255,6 +260,7 @@ def grade_of(
         last: Error of the last model.
         deviation: Of the measurement from the model without the effect, along the effect's way.
         has_rivals: Whether another effect does nearly as well in its place.
+        complete: Whether the library has what the events show.
         settings: Limits.
     """
     total, own = _share_left(start, last, settings), _share_left(without, last, settings)
@@ -267,7 +273,7 @@ def grade_of(
     if not (at_floor or explained):
         return Grade.STAND_IN, False
     # at the floor, but not within chance: what is left tells that the world is another than the model's
-    sure = chance or (explained and total <= settings.sure_left)
+    sure = chance or (complete and explained and total <= settings.sure_left)
     level = max(last.level, settings.usual)
     least = settings.weak_exact if last.error <= settings.exact * level else settings.weak
     weak = without.error - level < least or deviation < settings.sure_away

@@ -93,6 +93,11 @@ class SeenEffects:
         return self.entry_of(FULL_BUS) is not None
 
     @property
+    def of_no_effect(self) -> bool:
+        """Whether something is seen that an effect of dase makes and none of the library."""
+        return any(told_by(one, EFFECTS) and not told_by(one, self.library) for one in self.entries)
+
+    @property
     def effects(self) -> dict[str, str]:
         """Effects of the library that are certain, each to what shows it."""
         return {name: entry.sentence for entry in self.entries for name in self.identified_by(entry)}

@@ -99,6 +99,24 @@ def test_what_saturates_or_is_slow_or_uncertain_is_no_drift():
     assert not replace(drift, rate=0.3, from_none=0.3).is_leak(DRIFT)
 
 
+@pytest.mark.parametrize("step", [2.58e-4, 9e-4])
+def test_a_clock_makes_no_leak_whether_a_library_has_it_or_not(scene, monkeypatch, step):
+    """One of 0.26 ms was called a leak of 2.5 thresholds per second where no effect of a clock was known."""
+    clock = Sensor().with_effect(EFFECTS["timestamp"](step=step))
+    models = []
+    of_model = LightBetweenEvents.of_model
+    monkeypatch.setattr(
+        LightBetweenEvents, "of_model",
+        lambda light, sensor, seed: models.append(sensor) or of_model(light, sensor, seed=seed),
+    )  # fmt: skip
+    monkeypatch.setattr(Drift, "is_leak", lambda drift, settings: True)
+    structure = TimestampStructure(step=step)
+    found(scene, dase.simulate(scene, clock, seed=1), structure=structure)
+    assert [one["timestamp"].step for one in models] == [step]
+    found(scene, dase.simulate(scene, clock, seed=1), clock, structure=structure)
+    assert models[-1] == clock
+
+
 def test_events_that_wait_for_their_row_tell_nothing(scene):
     """Meanwhile light goes on, one way before ON events and the other before OFF events."""
     events = dase.simulate(scene, Sensor().with_effect(EFFECTS["leak"](rate=3.0)), seed=1)

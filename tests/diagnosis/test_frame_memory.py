@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import pytest
+from helpers.frame_simulator import bright_texture, counted_between_frames
 
 import dase
 from dase.effects import HighPass
-from tests.helpers.frame_simulator import bright_texture, counted_between_frames
 
 WAYS = {"frames": "compared with the one before alone", "sending frames": "take the light of their frame"}
 

@@ -101,6 +101,24 @@ def test_grades(start, without, last, deviation, rivals, grade, unknown):
     assert found == (grade, unknown)
 
 
+def test_what_leaves_little_is_in_doubt_where_something_is_seen_that_no_effect_of_the_library_makes():
+    """A lamp was seen that the library had not: noise of the voltage left 4 %, and was supported."""
+    for complete, last, grade in (
+        (True, 1.9, Grade.SUPPORTED), (False, 1.9, Grade.EITHER), (False, 0.3, Grade.SUPPORTED),
+    ):  # fmt: skip
+        found = grade_of(
+            judged(40.0), judged(30.0), judged(last, reach=1.5), 6.0, has_rivals=False, complete=complete,
+            settings=GradeSettings(),
+        )  # fmt: skip
+        assert found[0] is grade
+    lamp = Signature(name="flicker", answer=Answer.FOUND, details={"frequency": 100.0})
+    rows = Signature(name="grouping", answer=Answer.FOUND)
+    less = {name: one for name, one in EFFECTS.items() if name != "flicker"}
+    assert not SeenEffects((lamp, rows)).of_no_effect
+    assert SeenEffects((lamp, rows), library=less).of_no_effect
+    assert not SeenEffects((rows,), library=less).of_no_effect
+
+
 @pytest.mark.parametrize(
     ("low", "value", "high", "strained"),
     [

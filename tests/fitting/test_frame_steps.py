@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from helpers.frame_simulator import bright_texture, counted_between_frames
 
 import dase
 from dase.diagnosis import seen_effects
@@ -25,7 +26,6 @@ from dase.probes.timestamp_patterns import find_structure
 from dase.scenes.video import VideoScene
 from dase.signatures.result import Answer, Signature
 from dase.simulation.sensor import Sensor
-from tests.helpers.frame_simulator import bright_texture, counted_between_frames
 
 STEP, SIZE = 0.01, (40, 50)
 
