@@ -40,6 +40,11 @@ from dase.signatures.kinds import (
 )
 
 
+LATE_IN_DEAD_TIME = 1.5
+"""Times of a dead time and a frame up to which what events wait for may look like a pole: one of 6.2 ms of v2e,
+beside frames each 1.6 ms, looked like one of 10.5 ms."""
+
+
 def look_beside_model(
     state: DiagnosisState, seen: SeenEffects, measurement: Measurement, model: FittedModel
 ) -> SeenEffects:
@@ -121,7 +126,7 @@ def _without_delays_of_dead_time(task: DiagnosisTask, seen: SeenEffects, model: 
         return seen
     dead_time = model.sensor[REFRACTORY]
     assert isinstance(dead_time, Refractory)
-    longest = dead_time.period + frame_step
+    longest = LATE_IN_DEAD_TIME * (dead_time.period + frame_step)
     kept = (one for one in seen.entries if one.name != LATE_EVENTS or time_of_delay(one) > longest)
     return replace(seen, entries=tuple(kept))
 
