@@ -39,10 +39,9 @@ from dase.signatures.kinds import (
     UNEQUAL_THRESHOLDS,
 )
 
-
 LATE_IN_DEAD_TIME = 1.5
-"""Times of a dead time and a frame up to which what events wait for may look like a pole: one of 6.2 ms of v2e,
-beside frames each 1.6 ms, looked like one of 10.5 ms."""
+"""Times of a dead time and a frame up to which what events wait for may look like a pole: one of 6.2 ms of
+v2e, beside frames each 1.6 ms, looked like one of 10.5 ms."""
 
 
 def look_beside_model(
