@@ -6,27 +6,14 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from helpers.search_models import GATE, judged, model_with
 
 from dase.diagnosis import exchange
 from dase.diagnosis.exchange import exchange_effects
 from dase.diagnosis.state import DiagnosisState, DiagnosisTask, SearchPath
 from dase.effects import EFFECTS
-from dase.fitting.model import FittedModel, model_of
+from dase.fitting.model import FittedModel
 from dase.results import Rank, Step
-from dase.simulation.sensor import Sensor
-
-GATE = 1.2
-
-
-def model_with(*names: str) -> FittedModel:
-    sensor = Sensor()
-    for name in names:
-        sensor = sensor.with_effect(EFFECTS[name]())
-    return model_of(sensor)
-
-
-def judged(error: float) -> Any:
-    return SimpleNamespace(error=error, gate=GATE, level=0.2, reach=0.5, families={})
 
 
 def tried(name: str, error: float, *beside: str) -> Any:
