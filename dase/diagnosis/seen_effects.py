@@ -94,7 +94,9 @@ class SeenEffects:
 
     @property
     def of_no_effect(self) -> bool:
-        """Whether something is seen that an effect of dase makes and none of the library."""
+        """Whether something is seen that an effect of dase makes and none of the library, if these say so."""
+        if any(effect.signatures is None for effect in self.library.values()):
+            return False  # a user's effect may make it
         return any(told_by(one, EFFECTS) and not told_by(one, self.library) for one in self.entries)
 
     @property

@@ -117,6 +117,8 @@ def test_what_leaves_little_is_in_doubt_where_something_is_seen_that_no_effect_o
     assert not SeenEffects((lamp, rows)).of_no_effect
     assert SeenEffects((lamp, rows), library=less).of_no_effect
     assert not SeenEffects((rows,), library=less).of_no_effect
+    own = type("Own", (EFFECTS["shot"],), {"name": "own", "signatures": None})
+    assert not SeenEffects((lamp, rows), library={**less, "own": own}).of_no_effect
 
 
 @pytest.mark.parametrize(
