@@ -55,7 +55,7 @@ def exchange_effects(
         finalists = _in_its_place(task, model, bare, name, judgement)
         if not finalists:
             continue
-        state.note_rivals(name, finalists, judgement)
+        state.note_rivals(name, finalists, judgement.error)
         best = finalists[0]
         if best.error >= judgement.error - task.settings.material:
             continue

@@ -219,28 +219,23 @@ class DiagnosisState:
             finalists: All candidates that were judged with it.
             without: The error of the model without it.
         """
-        path, name = self.path, best.name
-        others = [one for one in finalists if one.name != name]
-        self.path = replace(
-            path,
-            alternatives={**path.alternatives, name: others},
-            error_of={**path.error_of, name: best.error},
-            without={**path.without, name: without} if reaches_floor(without) else path.without,
-        )
+        self.note_rivals(best.name, [one for one in finalists if one.name != best.name], best.error)
+        if reaches_floor(without):
+            self.path = replace(self.path, without={**self.path.without, best.name: without})
 
-    def note_rivals(self, name: str, finalists: Sequence[Candidate], judgement: Judgement) -> None:
-        """Keep what does nearly as well as an effect beside all others of the last model.
+    def note_rivals(self, name: str, others: Sequence[Candidate], error: float) -> None:
+        """Keep what was judged in the place of an effect, beside the same others.
 
         Args:
             name: Of the effect.
-            finalists: Candidates that were judged in its place.
-            judgement: The held-out error with it.
+            others: Candidates in its place.
+            error: The held-out error with the effect.
         """
         path = self.path
         self.path = replace(
             path,
-            alternatives={**path.alternatives, name: finalists},
-            error_of={**path.error_of, name: judgement.error},
+            alternatives={**path.alternatives, name: others},
+            error_of={**path.error_of, name: error},
         )
 
     def leave_at_first_step(self) -> None:

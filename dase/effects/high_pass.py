@@ -49,8 +49,7 @@ def change_from_frame(
 ):
     """A voltage of which the step of the last sample is whole, and what was there before that has faded."""
     memory = signal - before
-    kept = wp.where(cutoff == 0.0, 1.0, exponential(-2.0 * wp.pi * cutoff * dt))
-    passed = memory + (output - memory) * kept + voltage - input
+    passed = memory + (output - memory) * exponential(-2.0 * wp.pi * cutoff * dt) + voltage - input
     passed = wp.where(dt >= REST, voltage, passed)
     if cutoff == 0.0:
         passed = voltage  # sums of differences would round
@@ -70,12 +69,13 @@ def change_since_sending(
 ):
     """The same, where fades what is left to a pixel that has sent since the sample before."""
     now = signal - before
-    has_sent = wp.abs(now - memory) > 1.0e-4  # no threshold is as small
+    # a leak moves the memory by less in a step, and no threshold is as small
+    has_sent = wp.abs(now - memory) > 2.0e-2
     kept = wp.where(has_sent, exponential(-2.0 * wp.pi * cutoff * dt), 1.0)
     passed = now + (output - now) * kept + voltage - input
     passed = wp.where(dt >= REST, voltage, passed)
     if cutoff == 0.0:
-        passed = voltage
+        passed = voltage  # sums of differences would round
     return passed, voltage, passed, now
 
 

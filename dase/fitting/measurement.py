@@ -192,7 +192,12 @@ def _as_shown(measurement: Measurement) -> Measurement:
         return measurement
     step = comes_before_its_light(measurement.events, scene)
     if step is not None:
-        return replace(measurement, scene=scene.begun_early(step))
+        begun = scene.begun_early(step)
+        note = (
+            "events at a frame tell of the light after it: the clip is taken "
+            f"{format_seconds(begun.early)} earlier"
+        )
+        return replace(measurement, scene=begun, notes=(*measurement.notes, note))
     if not holds_frames(measurement.events, scene):
         return measurement
     shown = scene.held(STIMULUS.common_step)

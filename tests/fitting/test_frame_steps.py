@@ -94,13 +94,26 @@ def test_what_other_simulators_forget_from_frame_to_frame_is_simulated_exactly(c
     assert np.abs(on - theirs).sum() > 0.1 * theirs.sum()
 
 
+def test_a_leak_is_not_taken_for_an_event_at_which_a_pixel_forgets(clip, device):
+    """A memory that a leak moves by 0.001 a frame counted as one that had sent, and forgot at each frame."""
+    model = dase.Sensor().with_effect(EFFECTS["threshold"](on=0.1, off=0.1, phase=0.0))
+    model = model.with_effect(HighPass(at="sending frames", cutoff=1e5))
+    leaky = model.with_effect(EFFECTS["leak"](rate=1.0, spread=0.0))
+    plain, beside = (len(dase.simulate(clip, one, seed=1, device=device)) for one in (model, leaky))
+    every = dase.Sensor(model.effects).with_effect(HighPass(at="frames", cutoff=1e5))
+    assert len(dase.simulate(clip, every, seed=1, device=device)) < 0.95 * plain
+    assert beside == pytest.approx(plain, rel=0.03)
+
+
 @pytest.mark.parametrize("hot", [0, 40])
 def test_events_that_are_stamped_with_the_frame_before_are_of_the_light_after_it(hot):
     """AirSim's; taken for the light before it, a clip without any effect ended at an error of 10."""
     clip = bright_texture(STEP)
     events = counted_between_frames(clip, 0.0, forgets="frames", hot=hot)
     assert comes_before_its_light(events, clip) == pytest.approx(STEP)
-    shown = as_measurement(events, clip).scene
+    measurement = as_measurement(events, clip)
+    assert any("tell of the light after it" in note for note in measurement.notes)
+    shown = measurement.scene
     assert isinstance(shown, VideoScene)
     assert shown.sample_times()[0] == pytest.approx(-0.01 * STEP)
     assert shown.frame_times()[0] == pytest.approx(0.0)
