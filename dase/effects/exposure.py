@@ -133,4 +133,5 @@ class Exposure(Effect):
         if not self.amplitude:
             return math.inf
         lasts = [span for span in (self.exposure, self.period - self.exposure) if span > 0]
-        return min(min(lasts, default=self.period) / 8, BURST)
+        # two samples at least lie inside, so both edges are met; more would only make the bursts sharper
+        return min(min(lasts, default=self.period) / 3, BURST)

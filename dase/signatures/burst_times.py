@@ -43,6 +43,7 @@ class BurstTimeSettings:
     reaches: tuple[float, ...] = (2.5e-3, 1e-3)  # [s] bursts last 1 to 3 ms; other events lie evenly in less
     fewest_events: int = 8  # in a burst: of less, the middle tells no time
     uneven: float = 2e-3  # [s] bursts farther from even times, in the median, have no period
+    shortest: float = 5e-4  # [s] edges of an exposure that lie closer are one burst of both polarities
 
 
 def find_burst_times(
@@ -78,7 +79,9 @@ def find_burst_times(
     interval = float(np.mean([slope for slope, _ in found.values()]))
     if len(found) == 2:
         lasts = (found["OFF"][1] - found["ON"][1]) % interval
-        return BurstTimes(interval, found["ON"][1], lasts)
+        # from OFF to ON and back may be less than a burst lasts: nobody sees which of the two came first
+        wide = min(max(lasts, s.shortest), max(interval - s.shortest, 0.5 * interval))
+        return BurstTimes(interval, found["ON"][1] - 0.5 * (wide - lasts), wide)
     if exposure is None or not 0 < exposure < interval:
         return None
     at = found["ON"][1] if "ON" in found else found["OFF"][1] - exposure

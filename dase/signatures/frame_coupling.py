@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -98,6 +99,22 @@ class _Folded:
         return out
 
 
+def _evened(counts: NDArray[np.uint32]) -> NDArray[np.float64]:
+    """Return the events of a polarity by step with each tile as heavy as its events are few, shape (K,).
+
+    What couples into all pixels alike is lost where a scene moves and stands out where none does: weights of
+    one over a tile's rate give it the least variance. They are scaled so that the variance is the mean again.
+
+    Args:
+        counts: Events by step and tile, shape (K, T).
+    """
+    rate = counts.mean(0)
+    weight = 1 / (rate + 1 / len(counts))
+    weight *= (weight @ rate) / max(weight**2 @ rate, 1e-12)
+    out: NDArray[np.float64] = counts @ weight
+    return out
+
+
 def _usual_rate(counts: NDArray[np.float64], step: float, settings: CouplingSettings) -> NDArray[np.float64]:
     # a simulator's events may come at every other step alone
     even = uniform_filter1d(counts, max(round(settings.even / step), 1), mode="nearest")
@@ -106,19 +123,34 @@ def _usual_rate(counts: NDArray[np.float64], step: float, settings: CouplingSett
 
 
 def _fold(
-    counts: NDArray[np.float64], first: NDArray[np.int64], length: int, step: float, s: CouplingSettings
+    counts: NDArray[np.uint32],
+    first: NDArray[np.int64],
+    length: int,
+    step: float,
+    evens: bool,
+    s: CouplingSettings,
 ) -> _Folded | None:
     """Fold the counts of a polarity on the frames that begin at steps `first`, and test their common phase.
 
     In each frame the phases are ranked by their rate. If the frames had nothing to do with it, their clocks
     could be turned by any amount, so ranks of one phase are independent and uniform over the frames: minus
     the sum of their logarithms is gamma distributed (Fisher's combination), for each of the phases.
+
+    Args:
+        counts: Events by step and tile, shape (K, T).
+        first: Steps at which frames begin, shape (F,).
+        length: Steps of a frame.
+        step: Of the clock [s].
+        evens: Whether tiles weigh the more the fewer their events are.
+        s: What counts as a burst.
     """
+    total = counts.sum(1, dtype=np.float64)
+    weighed = _evened(counts) if evens else total
     # bursts come some tenths of a millisecond early or late
-    smooth = maximum_filter1d(np.convolve(counts, np.ones(3) / 3, "same"), 3)
-    usual = _usual_rate(counts, step, s)
+    smooth = maximum_filter1d(np.convolve(weighed, np.ones(3) / 3, "same"), 3)
+    usual = _usual_rate(weighed, step, s)
     places = first[:, None] + np.arange(length)
-    kept = counts[places].sum(1) >= s.fewest_events
+    kept = weighed[places].sum(1) >= s.fewest_events
     if kept.sum() < s.fewest_frames:
         return None
     places = places[kept]
@@ -127,7 +159,7 @@ def _fold(
     above = np.stack([length - np.searchsorted(o, v) for o, v in zip(order, score, strict=True)])
     p = stats.gamma.sf(-np.log(above / length).sum(0), len(score))
     at = int(p.argmin() if p.min() > 0 else score.mean(0).argmax())
-    excess = (counts - usual)[places].sum(0)
+    excess = (total - _usual_rate(total, step, s))[places].sum(0)
     return _Folded(score, min(1.0, length * float(p.min())), at, excess)
 
 
@@ -149,23 +181,28 @@ def _is_lamp(mean: NDArray[np.float64], at: int, step: float, s: CouplingSetting
 
 
 def _find_bursts(
-    counts: NDArray[np.uint32], step: float, high: float, s: CouplingSettings
+    counts: NDArray[np.uint32], step: float, high: float, evens: bool, s: CouplingSettings
 ) -> list[NDArray[np.int64]]:
     """Return the steps of bursts of the whole array, OFF and ON: many tiles, and `high` times the usual."""
     out = []
     for polarity in range(2):
         per_tile = counts[:, polarity].astype(np.float64)
         total = per_tile.sum(1)
-        usual = _usual_rate(total, step, s)
+        plain = usual = _usual_rate(total, step, s)
         share = per_tile.mean(0) / max(per_tile.mean(), 1e-12) / per_tile.shape[1]
+        active = share > 0.1 / len(share)
+        if evens:
+            total = _evened(counts[:, polarity])
+            usual = _usual_rate(total, step, s)
+            active = per_tile.sum(0) >= s.fewest_events
         rows = np.flatnonzero((total > high * usual + 20) & (total - usual > 10 * np.sqrt(usual + 1)))
         peaks = []
         for group in np.split(rows, np.flatnonzero(np.diff(rows) > 4) + 1):
             if not len(group):
                 continue
-            wanted = 2 * usual[group].sum() * share + 2
-            wide = (per_tile[group].sum(0) > wanted)[share > 0.1 / len(share)]
-            if wide.mean() > s.tiles:
+            wanted = 2 * plain[group].sum() * share + 2
+            wide = (per_tile[group].sum(0) > wanted)[active]
+            if len(wide) and wide.mean() > s.tiles:
                 peaks.append(group[total[group].argmax()])
         out.append(np.array(peaks, np.int64))
     return out
@@ -259,16 +296,16 @@ def find_frame_coupling(
         The signature, and when the bursts are, where there are any.
     """
     s = settings or CouplingSettings()
+    frames: tuple[NDArray[np.float64], float, float | None] | None = None
     if begins is not None and len(begins) >= 2:
-        interval = float(np.median(np.diff(begins)))
-        return _look_in_step(clock, np.asarray(begins, np.float64), interval, None, level, s)
+        frames = np.asarray(begins, np.float64), float(np.median(np.diff(begins))), None
     said: tuple[Signature, BurstClock | None] | None = None
-    for high in s.high:
-        found = _search_bursts(clock, high, s)
-        entry = _without_bursts(clock, s) if found is None else _look_in_step(clock, *found, level, s)
+    for evens, high in product((False, True), s.high[:1] if frames else s.high):
+        found = frames or _search_bursts(clock, high, evens, s)
+        entry = _look_in_step(clock, *found, evens, level, s) if found else _without_bursts(clock, s)
         if entry[0].found:
             return entry
-        # what else the lower limit meets is not the frames'
+        # what else is met by a lower limit, or where little moves, is not the frames'
         said = said or entry
     assert said is not None
     return said
@@ -289,6 +326,7 @@ def _look_in_step(
     begins: NDArray[np.float64],
     interval: float,
     p: float | None,
+    evens: bool,
     level: float,
     s: CouplingSettings,
 ) -> tuple[Signature, BurstClock | None]:
@@ -299,6 +337,7 @@ def _look_in_step(
         begins: When frames begin [s], shape (F,).
         interval: Time from one to the next [s].
         p: Chance of bursts that tell as even times; None where frames tell them.
+        evens: Whether tiles weigh the more the fewer their events are.
         level: p below which they are there.
         s: What counts as a burst.
     """
@@ -310,7 +349,7 @@ def _look_in_step(
     length = round(interval / step)
     first = np.round((begins - clock.begin) / step).astype(np.int64)
     whole = (first >= 0) & (first + length <= len(counts))
-    folded = [_fold(counts[:, k].sum(1, dtype=np.float64), first[whole], length, step, s) for k in range(2)]
+    folded = [_fold(counts[:, k], first[whole], length, step, evens, s) for k in range(2)]
     known = [(k, f) for k, f in enumerate(folded) if f is not None]
     if not known:
         frames = int(whole.sum())
@@ -320,11 +359,11 @@ def _look_in_step(
 
 
 def _search_bursts(
-    clock: ClockCounts, high: float, s: CouplingSettings
+    clock: ClockCounts, high: float, evens: bool, s: CouplingSettings
 ) -> tuple[NDArray[np.float64], float, float] | None:
     """Return times in step with bursts of the whole array [s], their interval [s], and its p."""
     best = None
-    for peaks in _find_bursts(clock.counts, clock.settings.step, high, s):
+    for peaks in _find_bursts(clock.counts, clock.settings.step, high, evens, s):
         if len(peaks) < s.fewest_frames:
             continue
         times = clock.times[peaks]

@@ -65,6 +65,18 @@ def test_one_edge_needs_the_exposure_of_the_file(rng):
     assert (found.begin - 1.0) % 0.05 == pytest.approx(0.0, abs=2e-4)
 
 
+@pytest.mark.parametrize("exposure", [0.0, 2e-5, 0.04998])
+def test_bursts_of_both_polarities_at_one_time_are_an_exposure_of_half_a_millisecond(rng, exposure):
+    """No more is known: half as long would be simulated at twice as many times."""
+    begins = 1.0 + 0.05 * np.arange(40)
+    phases = {"ON": 0.01, "OFF": (0.01 + exposure) % 0.05}
+    found = find_burst_times(bursts(rng, begins, exposure), details(begins - 0.01, phases))
+    assert found is not None
+    assert min(found.exposure, found.interval - found.exposure) == pytest.approx(5e-4, abs=1e-4)
+    off = (found.begin + 0.5 * found.exposure - 1.0 - 0.5 * exposure) % 0.05
+    assert min(off, 0.05 - off) < 2e-4
+
+
 def test_frames_without_a_period_have_no_even_times(rng):
     begins = np.cumsum(rng.uniform(0.03, 0.07, 60))
     assert find_burst_times(bursts(rng, begins, 0.01), details(begins, {"ON": 0.0, "OFF": 0.01})) is None

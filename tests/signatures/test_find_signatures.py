@@ -202,6 +202,19 @@ def test_bursts_of_three_times_the_usual_rate_are_seen(rng):
     assert not dase.find_signatures(anywhere(rng, usual))["frame coupling"].found
 
 
+def test_bursts_show_where_little_moves(rng):
+    """7 % of the pixels send each 18 ms, less than twice the rate of what moves in a quarter of them."""
+    busy = anywhere(rng, rng.uniform(0.0, 1.0, 400_000))
+    busy = replace(busy, x=busy.x // 2, y=busy.y // 2)
+    weak = anywhere(rng, pulses(rng, 0.018, 600, 2e-3))
+    both = Events.concatenate([busy, weak])
+    entry = dase.find_signatures(both.select(np.argsort(both.t, kind="stable")))["frame coupling"]
+    assert entry.found
+    assert entry.details["interval"] == pytest.approx(0.018, rel=3e-2)
+    assert entry.details["share"] == pytest.approx(len(weak) / (len(busy) + len(weak)), rel=0.3)
+    assert not dase.find_signatures(busy)["frame coupling"].found
+
+
 def test_what_repeats_too_often_for_frames_is_not_asked_for_below_the_first_limit(rng):
     times = np.concatenate([rng.uniform(0.0, 1.0, 300_000), pulses(rng, 0.008, 700, 1e-3)])
     assert dase.find_signatures(anywhere(rng, times))["frame coupling"].answer is Answer.NOT_SEEN
