@@ -11,7 +11,14 @@ from dataclasses import replace
 
 from dase.diagnosis.cell_descriptions import worst_cells
 from dase.diagnosis.detection_limits import find_detection_limits
-from dase.diagnosis.grading import ModelOnReport, grade_effects, is_far_off, judge_on_report, leaves_little
+from dase.diagnosis.grading import (
+    ModelOnReport,
+    grade_effects,
+    is_far_off,
+    judge_on_report,
+    leaves_little,
+    offer_what_halves,
+)
 from dase.diagnosis.late_within_frames import doubt_delays_within_frames
 from dase.diagnosis.ranking import values_of
 from dase.diagnosis.remainder import describe_unexplained, share_of_scene, what_to_record
@@ -76,6 +83,8 @@ def conclude_diagnosis(
         explained = explained.without(name) if one.grade is Grade.STAND_IN else explained
     part = part_to_simulate(measurement, task.evidence.when)
     seen = without_the_explained(seen, part, explained, task.seed, before=start.sensor)
+    judged_effects = offer_what_halves(task, judged_effects, last, at_bounds)
+    seen = seen.without_ceiling_of_light(model.sensor)
     said = seen.findings(judged_effects.values(), names)
     findings = {one.effect: one for one in said if one.grade is not Grade.STAND_IN}
     kept = tuple(n for n in order if n in findings and findings[n].grade is not Grade.EITHER)

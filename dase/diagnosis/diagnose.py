@@ -20,7 +20,7 @@ from dase.diagnosis.direct_readings import (
     with_jitter_of_events,
 )
 from dase.diagnosis.effect_search import search_effects
-from dase.diagnosis.few_hot_pixels import hot_effect_of, with_hot_pixels
+from dase.diagnosis.few_hot_pixels import with_hot_pixels
 from dase.diagnosis.frame_memory import with_memory_of_frames
 from dase.diagnosis.held_frames import (
     held_behind_low_pass,
@@ -293,7 +293,7 @@ def _with_what_pixels_show(
         silent = without_the_explained_silence(silent, measurement, model.sensor, seed=task.seed)
         found = with_dead_pixels(found, silent)
     if compared.hot is not None:
-        found = with_hot_pixels(found, *hot_effect_of(measurement.events, compared.hot))
+        found = with_hot_pixels(found, measurement, compared.hot, seed=task.seed)
     if strength is not None:
         task.progress("how strong the bursts are", 0.95, found.errors[-1])
         # beside other effects it may be another

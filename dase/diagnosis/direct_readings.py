@@ -277,6 +277,12 @@ def _with_certain(found: Diagnosis, effect: Effect, sentence: str, mine: Mapping
     name = effect.name
     before = next((one for one in found.findings if one.effect == name), None)
     now = Finding(name, Grade.CERTAIN, seen=sentence, parameters=dict(mine))
+    fitted = next((one for one in found.stand_ins if one.effect == name), None)
+    if fitted is not None:
+        # the fit of a model that leaves too much has another one: either may be something unknown
+        stand_ins = tuple(one for one in found.stand_ins if one.effect != name)
+        now = replace(now, grade=Grade.EITHER, unknown=True, error_with=fitted.error_with)
+        return replace(found, findings=(*found.findings, now), stand_ins=stand_ins)
     if before is not None:
         now = replace(now, error_without=before.error_without, error_with=before.error_with)
     sensor, selected, errors = found.sensor, found.selected, found.errors

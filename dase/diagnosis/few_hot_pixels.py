@@ -7,7 +7,6 @@ compared, and counted where all of them are known.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,9 +16,15 @@ from scipy import stats
 from dase.diagnosis.seen_effects import SeenEffects
 from dase.effects.base import Effect
 from dase.effects.hot import Hot
+from dase.effects.stream import StreamEffect
 from dase.events import Events
+from dase.fitting.measurement import Measurement
+from dase.probes.random_streams import SimulationStream
 from dase.results import Diagnosis, Estimate
+from dase.scenes.between_frames import CameraScene
 from dase.signatures import kinds
+from dase.simulation.sensor import Sensor
+from dase.simulation.simulate import simulate
 
 NAME = Hot.name
 
@@ -30,6 +35,12 @@ class HotPixelSettings:
 
     few: float = 3.0
     """Hot pixels that a part of the measurement would have in the mean, below which they are too few."""
+
+    fewest: int = 3
+    """As many are announced, at least."""
+
+    of_light: float = 0.5
+    """Share of a pixel's events that a model sends without the effect, from which on light explains them."""
 
     side: float = 0.95
     """Of Student's law up to which intervals of 90 % go: few pixels know how far they lie apart no better."""
@@ -100,10 +111,60 @@ def hot_effect_of(
     return effect, {f"{NAME}.{name}": one for name, one in found.items()}
 
 
-def with_hot_pixels(found: Diagnosis, effect: Effect, parameters: Mapping[str, Estimate]) -> Diagnosis:
-    """Return a diagnosis, made without the hot pixels, with the effect that makes them."""
+def beyond_the_model(
+    measurement: Measurement,
+    pixels: NDArray[np.int64],
+    sensor: Sensor,
+    *,
+    seed: int,
+    settings: HotPixelSettings = HOT_PIXELS,
+) -> NDArray[np.int64]:
+    """Return the hot pixels without those of which a model without the effect sends half of the events.
+
+    Light alone sends many where a response is steep, as that of a lin-log sensor in its dark is.
+
+    Args:
+        measurement: Its scene is simulated; between a camera's frames it is a guess, and tells nothing.
+        pixels: Which are hot, row-major, shape (K,).
+        sensor: The model.
+        seed: Of its random numbers.
+        settings: What counts.
+    """
+    if isinstance(measurement.scene, CameraScene):
+        return pixels
+    # a bus needs the events of all pixels, and leaves of these what tells of them
+    alone = replace(sensor, effects=tuple(e for e in sensor.effects if not isinstance(e, StreamEffect)))
+    made = simulate(
+        measurement.scene, alone, seed=SimulationStream.HOT_PIXELS.seed(seed), pixels=np.sort(pixels)
+    )
+
+    def sent(events: Events) -> NDArray[np.int64]:
+        at = events.y.astype(np.int64) * events.width + events.x
+        return np.bincount(at, minlength=events.width * events.height)[pixels]
+
+    by_light = sent(replace(measurement, events=made).compared_events())
+    return pixels[by_light < settings.of_light * sent(measurement.compared_events())]
+
+
+def with_hot_pixels(
+    found: Diagnosis, measurement: Measurement, pixels: NDArray[np.int64], *, seed: int
+) -> Diagnosis:
+    """Return a diagnosis, made without the hot pixels, with the effect that makes them.
+
+    Args:
+        found: Its sensor is the model.
+        measurement: The light and the events.
+        pixels: Which are hot, row-major, shape (K,).
+        seed: Of random numbers.
+    """
     if not any(one.effect == NAME for one in found.findings):
         return found  # the scene shows as much
+    pixels = beyond_the_model(measurement, pixels, found.sensor, seed=seed)
+    if len(pixels) < HOT_PIXELS.fewest:
+        others = tuple(one for one in found.findings if one.effect != NAME)
+        note = "pixels that looked hot send as much by their light in the last model, and are not"
+        return replace(found, findings=others, notes=(*found.notes, note))
+    effect, parameters = hot_effect_of(measurement.events, pixels)
     return replace(
         found,
         sensor=found.sensor.with_effect(effect),

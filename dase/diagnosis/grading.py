@@ -16,7 +16,10 @@ part, by which nothing was chosen. Each effect has to earn its grade there:
   A little jitter or mismatch beside a dead time is in doubt, too: a world that looks for crossings at steps
   of time makes it when a dead time ends, or by how far beyond the threshold a memory is set.
 
-An effect that earns neither is a stand-in: it is named as what comes nearest, and not found.
+- *either* it *or* something unknown, too, where much is left of the error, if half of what is left without
+  it at least goes with it.
+
+An effect that earns none of these is a stand-in: it is named as what comes nearest, and not found.
 """
 
 from __future__ import annotations
@@ -98,13 +101,12 @@ def grade_effects(
     settings = task.settings.grades
     mine = {n: {axis: v for axis, v in values.items() if axis.split(".")[0] == n} for n in found}
     if not leaves_little(start.judgement, last, settings):
-        # whatever is left without them, none is found: only what the search knows by the way is said
-        alone = {name: way.get(frozenset(found) - {name}) for name in found}
+        # whatever is left without them, none is found
+        alone = _left_without(task, model, found, {frozenset(): start, **way})
         return {
             name: Finding(
-                name, Grade.STAND_IN, error_without=bare.judgement.error if bare else math.nan,
-                error_with=last.error, parameters=mine[name],
-            ) for name, bare in alone.items()
+                name, Grade.STAND_IN, error_without=alone[name], error_with=last.error, parameters=mine[name]
+            ) for name in found
         }  # fmt: skip
     without = _models_without(task, model, found, {frozenset(): start, **way})
     misfit = misfit_beyond_chance(report)
@@ -149,6 +151,32 @@ def grade_effects(
             deviation=deviations[name],
             parameters=mine[name],
         )
+    return out
+
+
+def offer_what_halves(
+    task: DiagnosisTask, findings: Mapping[str, Finding], last: Judgement, at_bounds: Sequence[str]
+) -> dict[str, Finding]:
+    """Return findings with the stand-ins that explain half of what is left without them, at least, in doubt.
+
+    Much is left of the error, and what else is missing nobody knows; but what explains so much is oftener
+    there than not. Between a camera's frames a guess at the light may be as wrong, and none is offered.
+
+    Args:
+        task: What the diagnosis is asked.
+        findings: Of each effect of the last model.
+        last: Its error on the part that reports.
+        at_bounds: Sentences on parameters that ended where their search does.
+    """
+    settings, out = task.settings.grades, dict(findings)
+    if may_be_announced(last) or task.evidence.report.doubt is not None:
+        return out
+    level = max(last.level, settings.usual)
+    for name, one in findings.items():
+        stopped = any(text.startswith((f"{name}.", "threshold.")) for text in at_bounds)
+        left = max(last.error - level, 0.0) / max(one.error_without - level, 1e-9)
+        if one.grade is Grade.STAND_IN and not stopped and left <= settings.half_left:
+            out[name] = replace(one, grade=Grade.EITHER, unknown=True)
     return out
 
 
@@ -304,6 +332,22 @@ def _models_without(
         name: min((one for names, one in every if names <= wanted[name]), key=lambda one: one.judgement.error)
         for name in found
     }
+
+
+def _left_without(
+    task: DiagnosisTask,
+    model: FittedModel,
+    found: Sequence[str],
+    way: Mapping[frozenset[str], ModelOnReport],
+) -> dict[str, float]:
+    """Return for each effect of a model that leaves much the least error without it; NaN where nobody knows.
+
+    Between a camera's frames nothing is said by that, and only what the search knows by the way is looked up.
+    """
+    if task.evidence.report.doubt is None:
+        return {n: one.judgement.error for n, one in _models_without(task, model, found, way).items()}
+    alone = {name: way.get(frozenset(found) - {name}) for name in found}
+    return {name: one.judgement.error if one else math.nan for name, one in alone.items()}
 
 
 def _rivals_to_try(

@@ -18,6 +18,7 @@ from dase.diagnosis.led_pixels import follow_the_light
 from dase.effects import EFFECTS, Effect
 from dase.effects.high_pass import HighPass
 from dase.effects.made_signatures import makers_of, told_by
+from dase.effects.readout import BUSY, Readout
 from dase.effects.threshold import Threshold
 from dase.errors import InputError
 from dase.events import Events
@@ -57,6 +58,9 @@ search. What that lacks may have made them too high to see a lamp in the clip: a
 WEAK_TONE = 0.1
 """Swing of the rate below which a tone may be what bursts leave beside them; lamps swung it by 0.19 and more
 in 18 of 20 clips of other simulators in which one was seen."""
+
+ABOVE_CEILING = 4.0
+"""Times a ceiling of the rate of events at which a bus must have nothing to do for it to be no bus's."""
 
 FORGETS = (5.0, 20.0)
 """How fast the memories forget [Hz] of the models of which it is asked whether a pattern is the scene's.
@@ -110,6 +114,27 @@ class SeenEffects:
         entries = (entry for entry in self.entries if KINDS[entry.name].whatever_fits)
         return frozenset(name for entry in entries for name in self.identified_by(entry))
 
+    def without_ceiling_of_light(self, sensor: Sensor) -> SeenEffects:
+        """Return what is seen without a ceiling of the rate at which the bus that fits has nothing to do.
+
+        Things that move evenly send evenly, too: a fan's blades did, at a 25th of the rate of a bus that was
+        fitted beside them.
+
+        Args:
+            sensor: The last model.
+        """
+        entry, bus = (
+            self.entry_of(FULL_BUS),
+            next((e for e in sensor.effects if isinstance(e, Readout)), None),
+        )
+        ceiling = entry.details.get("rate", 0.0) if entry is not None else 0.0
+        if bus is None or not ceiling:
+            return self
+        taken = (bus.line if bus.by_lines else 0.0) + 1 / bus.rate
+        if ABOVE_CEILING * ceiling * taken >= BUSY:
+            return self
+        return replace(self, entries=tuple(one for one in self.entries if one is not entry))
+
     def times_of_bursts(self, measurement: Measurement) -> BurstTimes | None:
         """Return when the bursts of a measurement come; None where there are none at even times."""
         entry = self.entry_of(FRAME_COUPLING)
@@ -143,12 +168,17 @@ class SeenEffects:
         """
         seen = self.effects
         out = []
+        two_poles = self._two_poles_for_pole_and_delay(graded)
         for one in graded:
             if one.effect in self._noise and one.grade is Grade.STAND_IN:
                 # noise that comes so is there, but the model with it is another's
                 one = replace(one, grade=Grade.EITHER, unknown=True, seen=seen[one.effect])
             elif one.effect in self._contradicted and one.grade is Grade.SUPPORTED:
                 one = replace(one, grade=Grade.EITHER, unknown=True)
+            elif one.effect in two_poles:
+                one = replace(
+                    one, grade=Grade.EITHER, alternatives=two_poles[one.effect], seen=seen[one.effect]
+                )
             elif one.effect in seen:
                 one = Finding(
                     one.effect, Grade.CERTAIN, (), False, one.error_without, one.error_with, one.deviation,
@@ -176,9 +206,28 @@ class SeenEffects:
             if not named_here:
                 out = self._with_only_maker(entry, out)
             for name in named_here or (entry.name,):
+                others = two_poles.get(name, ())
+                grade = Grade.EITHER if others else Grade.CERTAIN
                 out = [one for one in out if one.effect != name]
-                out.append(Finding(name, Grade.CERTAIN, seen=entry.sentence))
+                out.append(Finding(name, grade, others, seen=entry.sentence))
         return out
+
+    def _two_poles_for_pole_and_delay(self, graded: Collection[Finding]) -> dict[str, tuple[str, ...]]:
+        """Return the effects that make a pole and a delay, each to that of two poles that a fit has beside.
+
+        Two slow poles, of 9 and 20 Hz, had looked like one of 14 Hz and a delay of 5.8 ms.
+
+        Args:
+            graded: What the search says of each effect of the last model.
+        """
+        kinds = makers_of(LATE_EVENTS, self._known)
+        seen = [name for one in self.entries if one.name == LATE_EVENTS for name in self.identified_by(one)]
+        fitted = tuple(
+            one.effect for one in graded
+            if one.effect in kinds and kinds[one.effect].by == "poles" and one.grade is not Grade.STAND_IN
+        )  # fmt: skip
+        told = {kinds[name].by for name in seen if name in kinds}
+        return dict.fromkeys(seen, fitted) if fitted and told == {"pole", "delay"} else {}
 
     def _with_only_maker(self, entry: Signature, findings: list[Finding]) -> list[Finding]:
         """Return findings with the only effect that is known to make what is seen, or what is not known.

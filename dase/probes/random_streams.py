@@ -53,6 +53,8 @@ class SimulationStream(Enum):
     """Events of a model whose thresholds stay as they are."""
     SILENT_PIXELS = (2300, 1)
     """Events of a model at pixels that are silent; a turn is a repeat."""
+    HOT_PIXELS = (2700, 0)
+    """Events of a model at pixels that seem to be hot."""
     STIMULUS = (0, 1000)
     """Standard recordings; a turn is a stimulus."""
     RECORDING = (1, 500_000)

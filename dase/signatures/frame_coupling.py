@@ -301,12 +301,16 @@ def find_frame_coupling(
         frames = np.asarray(begins, np.float64), float(np.median(np.diff(begins))), None
     said: tuple[Signature, BurstClock | None] | None = None
     for evens, high in product((False, True), s.high[:1] if frames else s.high):
+        if evens and said is not None and said[0].answer is Answer.CANNOT_SAY:
+            break
         found = frames or _search_bursts(clock, high, evens, s)
         entry = _look_in_step(clock, *found, evens, level, s) if found else _without_bursts(clock, s)
         if entry[0].found:
             return entry
         # what else is met by a lower limit, or where little moves, is not the frames'
         said = said or entry
+        if evens and entry[0].answer is Answer.CANNOT_SAY:
+            break  # three swings of a lamp look like bursts of frames, once a scene no longer hides them
     assert said is not None
     return said
 

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from helpers.brief_diagnosis import NO_LIMITS
 
 import dase
 from dase.diagnosis.diagnose import diagnose
-from dase.diagnosis.few_hot_pixels import few_hot_pixels, hot_effect_of
+from dase.diagnosis.few_hot_pixels import beyond_the_model, few_hot_pixels, hot_effect_of
 from dase.diagnosis.seen_effects import SeenEffects, find_seen_effects
 from dase.effects import EFFECTS
-from dase.fitting.measurement import Measurement, static_scene
+from dase.fitting.measurement import Measurement, camera_scene, static_scene
 from dase.results import Finding, Grade
 from dase.signatures.result import Answer, Signature
 from dase.simulation.sensor import Sensor
@@ -55,6 +57,29 @@ def test_noise_is_found_beside_a_few_hot_pixels(events):
     assert "shot" in found.selected
     assert found.errors[-1] < found.gate
     assert any("left out" in note for note in found.notes)
+
+
+def test_pixels_that_send_as_much_by_their_light_are_not_hot():
+    """Four pixels have light that changes, four send where it rests."""
+    light = np.full((301, 20, 20), 0.3, np.float32)
+    light[:, 4, :4] += 0.2 * np.sin(np.arange(301) * 0.4, dtype=np.float32)[:, None]
+    scene = dase.VideoScene(light, np.linspace(0.0, 1.5, 301))
+    sent = dase.simulate(scene, Sensor(), seed=1)
+    lit, dark = 4 * 20 + np.arange(4), 10 * 20 + np.arange(4)
+    own = dase.Events(
+        np.linspace(0.1, 1.4, 400), np.arange(400) % 4, np.full(400, 10), np.ones(400, bool), 20, 20
+    )
+    both = dase.Events.concatenate([sent, own])
+    measurement = Measurement(both.select(np.argsort(both.t, kind="stable")), scene)
+    left = beyond_the_model(measurement, np.concatenate([lit, dark]), Sensor(), seed=0)
+    np.testing.assert_array_equal(left, dark)
+    camera = replace(
+        measurement,
+        scene=camera_scene(
+            np.full((3, 20, 20), 80, np.uint8), *np.array([[0.0, 0.5, 1.0], [0.1, 0.6, 1.1]]), []
+        ),
+    )
+    assert len(beyond_the_model(camera, lit, Sensor(), seed=0)) == 4
 
 
 def test_hot_pixels_of_which_none_stands_out_may_be_something_else():

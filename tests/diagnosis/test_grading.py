@@ -197,11 +197,12 @@ def test_each_model_has_one_error(found):
     assert found.to_json()["findings"][0]["grade"] == "certain"
 
 
-def test_nothing_is_fitted_to_grade_effects_of_a_model_that_leaves_too_much(monkeypatch):
+def test_nothing_is_fitted_between_frames_to_grade_effects_of_a_model_that_leaves_too_much(monkeypatch):
+    """A guess at the light may be as wrong as a model, so what is left without an effect tells nothing."""
     monkeypatch.setattr(grading, "_models_without", lambda *args: pytest.fail("it was fitted"))
 
     bare = SimpleNamespace(judgement=judged(8.0))
-    task = SimpleNamespace(settings=DEFAULTS)
+    task = task_with_doubt(np.ones(1))
     # 0.2 of the first error is left above what chance makes
     told = grading.grade_effects(
         task, SearchPath(), None, ["leak", "shot"], {frozenset({"shot"}): bare},
@@ -212,6 +213,63 @@ def test_nothing_is_fitted_to_grade_effects_of_a_model_that_leaves_too_much(monk
     assert np.isnan(told["shot"].error_without)
     assert grading.leaves_little(judged(10.25), judged(1.74), DEFAULTS.grades)
     assert not grading.leaves_little(judged(10.25), judged(1.76), DEFAULTS.grades)
+
+
+def test_what_explains_half_of_what_is_left_is_in_doubt_and_no_stand_in():
+    """Above the usual 0.25 the last model leaves 3; 6 and more without an effect is twice that."""
+    left = {"leak": 6.3, "shot": 6.2, "dark": 20.0, "hot": float("nan"), "jitter": 20.0}
+    said = {n: Finding(n, Grade.STAND_IN, error_without=one, error_with=3.25) for n, one in left.items()}
+    said["leak"] = replace(said["leak"], grade=Grade.SUPPORTED)
+    bounds = ["jitter.spread = 1, the end of its search"]
+
+    def offered(last: float, task: SimpleNamespace) -> dict[str, Grade]:
+        found = grading.offer_what_halves(task, said, judged(last), bounds)
+        assert all(one.unknown for name, one in found.items() if one.grade is Grade.EITHER)
+        return {name: one.grade for name, one in found.items() if one.grade is not Grade.STAND_IN}
+
+    exact = task_with_doubt(None)
+    assert offered(3.25, exact) == {"leak": Grade.SUPPORTED, "dark": Grade.EITHER}
+    assert offered(3.2, exact) == {"leak": Grade.SUPPORTED, "dark": Grade.EITHER, "shot": Grade.EITHER}
+    # at the floor chance does that, and between a camera's frames a guess
+    assert offered(0.3, exact) == offered(3.2, task_with_doubt(np.ones(1))) == {"leak": Grade.SUPPORTED}
+
+
+def task_with_doubt(doubt: np.ndarray | None) -> SimpleNamespace:
+    """What grading asks of a task: its settings, and whether the scene is in doubt."""
+    return SimpleNamespace(settings=DEFAULTS, evidence=SimpleNamespace(report=SimpleNamespace(doubt=doubt)))
+
+
+def late(kind: str) -> Signature:
+    return Signature(name="late events", answer=Answer.FOUND, sentence=f"a {kind}", details={kind: 1.0})
+
+
+def test_a_pole_and_a_delay_may_be_two_poles_that_a_fit_has_beside():
+    """A bandwidth and a latency were certain, and wrong, for poles of 9 and 20 Hz."""
+    seen = SeenEffects((late("pole"), late("delay")))
+    pole = Finding("bandwidth", Grade.SUPPORTED)
+    two = Finding("second_order", Grade.EITHER, unknown=True)
+    grades = {one.effect: (one.grade, one.alternatives) for one in seen.findings([pole, two], ())}
+    assert grades["bandwidth"] == grades["latency"] == (Grade.EITHER, ("second_order",))
+    for beside in ([pole], [pole, replace(two, grade=Grade.STAND_IN)]):
+        grades = {one.effect: one.grade for one in seen.findings(beside, ())}
+        assert grades["bandwidth"] is grades["latency"] is Grade.CERTAIN
+
+
+def test_a_ceiling_of_the_rate_is_no_bus_that_is_much_faster():
+    """A fan sent 2.2 million events per second for a quarter of the time."""
+    entry = Signature(name="full bus", answer=Answer.FOUND, details={"rate": 2.2e6})
+    seen = SeenEffects((entry,))
+    for mode, rate, is_bus in (
+        ("delay", 5e7, False),
+        ("delay", 3e6, True),
+        ("drop", 5e7, False),
+        ("drop", 3e6, True),
+    ):
+        bus = Sensor().with_effect(EFFECTS["readout"](rate=rate, mode=mode))
+        assert seen.without_ceiling_of_light(bus).full_bus is is_bus
+    lines = Sensor().with_effect(EFFECTS["readout"](rate=5e7, line=2e-7, mode="rows"))
+    assert seen.without_ceiling_of_light(lines).full_bus
+    assert seen.without_ceiling_of_light(Sensor()).full_bus
 
 
 def test_an_effect_is_not_needed_where_the_last_model_does_as_well_once_it_is_taken_out(monkeypatch):
