@@ -180,8 +180,8 @@ class GradeSettings:
 
     half_left: float = 0.5
     """The same, up to which an effect of a model that leaves too much is either there or stands in for
-    something unknown: of the effects that were added to such models of exact scenes and left less, seven of
-    ten were there or habits of their simulator, of those that left more ten of 35."""
+    something unknown: of the effects that were added to such models of exact scenes and left less, six of
+    nine were there or habits of their simulator, of those that left more eleven of 48."""
 
     clear_left: float = 0.15
     """The same, below which an effect without which the model is not at the floor needs no deviation along

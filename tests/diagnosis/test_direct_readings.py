@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from helpers.brief_diagnosis import NO_LIMITS
@@ -9,10 +11,10 @@ from helpers.frame_simulator import HEIGHT, WIDTH, shaken_texture
 from helpers.held_pixels import held_with_low_pass
 
 import dase
-from dase.diagnosis.direct_readings import READINGS, _effects_of, with_jitter_of_events
+from dase.diagnosis.direct_readings import READINGS, _effects_of, _with_certain, with_jitter_of_events
 from dase.effects import EFFECTS
 from dase.fitting.delays_after_frames import DelaysAfterFrames
-from dase.results import Diagnosis, Grade
+from dase.results import Diagnosis, Finding, Grade
 from dase.scenes.video import VideoScene
 
 TRIED = {
@@ -57,6 +59,20 @@ def test_a_jitter_beside_noise_that_returns_may_be_that(spread, noisy, said):
     found = with_jitter_of_events(bare, model, noisy=noisy)
     grades = {one.effect: (one.grade, one.alternatives) for one in found.findings}
     assert grades == ({"jitter": said} if said else {})
+
+
+def test_a_reading_that_a_fit_of_a_wrong_model_contradicts_is_in_doubt():
+    """A low-pass of 589 Hz was read off a clip that was no held one, whose fit had one of 410 Hz."""
+    model = dase.Sensor().with_effect(EFFECTS["bandwidth"](cutoff=410.0))
+    fitted = Finding("bandwidth", Grade.STAND_IN, error_with=1.3)
+    bare = Diagnosis(model, (), (1.3,), 5.8, 1.0, 1.15, {}, None, (), stand_ins=(fitted,))
+    read = _with_certain(bare, EFFECTS["bandwidth"](cutoff=589.0), "later the farther", {})
+    assert [(one.effect, one.grade, one.unknown) for one in read.findings] == [
+        ("bandwidth", Grade.EITHER, True)
+    ]
+    assert (read.stand_ins, read.selected, read.sensor) == ((), (), model)
+    sure = _with_certain(replace(bare, stand_ins=()), EFFECTS["bandwidth"](cutoff=589.0), "so", {})
+    assert [one.grade for one in sure.findings] == [Grade.CERTAIN]
 
 
 @pytest.mark.slow
