@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
+from dase.diagnosis.model_at_pixels import count_at_pixels, count_of_model
 from dase.diagnosis.seen_effects import SeenEffects
 from dase.effects.base import Effect
 from dase.effects.hot import Hot
-from dase.effects.stream import StreamEffect
 from dase.events import Events
 from dase.fitting.measurement import Measurement
 from dase.probes.random_streams import SimulationStream
@@ -24,7 +24,6 @@ from dase.results import Diagnosis, Estimate
 from dase.scenes.between_frames import CameraScene
 from dase.signatures import kinds
 from dase.simulation.sensor import Sensor
-from dase.simulation.simulate import simulate
 
 NAME = Hot.name
 
@@ -132,18 +131,9 @@ def beyond_the_model(
     """
     if isinstance(measurement.scene, CameraScene):
         return pixels
-    # a bus needs the events of all pixels, and leaves of these what tells of them
-    alone = replace(sensor, effects=tuple(e for e in sensor.effects if not isinstance(e, StreamEffect)))
-    made = simulate(
-        measurement.scene, alone, seed=SimulationStream.HOT_PIXELS.seed(seed), pixels=np.sort(pixels)
-    )
-
-    def sent(events: Events) -> NDArray[np.int64]:
-        at = events.y.astype(np.int64) * events.width + events.x
-        return np.bincount(at, minlength=events.width * events.height)[pixels]
-
-    by_light = sent(replace(measurement, events=made).compared_events())
-    return pixels[by_light < settings.of_light * sent(measurement.compared_events())]
+    pixels = np.sort(pixels)
+    by_light = count_of_model(measurement, sensor, pixels, seed=SimulationStream.HOT_PIXELS.seed(seed))
+    return pixels[by_light < settings.of_light * count_at_pixels(measurement.compared_events(), pixels)]
 
 
 def with_hot_pixels(

@@ -130,7 +130,7 @@ def grade_effects(
     out: dict[str, Finding] = {}
     for name in found:
         others = rivals.get(name, ())
-        stopped = any(text.startswith((f"{name}.", "threshold.")) for text in at_bounds)
+        stopped = _has_stopped(name, at_bounds)
         grade, unknown = graded(name, bool(others))
         doubtful = any(
             is_strained(model, *one)
@@ -171,13 +171,17 @@ def offer_what_halves(
     settings, out = task.settings.grades, dict(findings)
     if may_be_announced(last) or task.evidence.report.doubt is not None:
         return out
-    level = max(last.level, settings.usual)
     for name, one in findings.items():
-        stopped = any(text.startswith((f"{name}.", "threshold.")) for text in at_bounds)
-        left = max(last.error - level, 0.0) / max(one.error_without - level, 1e-9)
+        left = _share_left(replace(last, error=one.error_without), last, settings)
+        stopped = _has_stopped(name, at_bounds)
         if one.grade is Grade.STAND_IN and not stopped and left <= settings.half_left:
             out[name] = replace(one, grade=Grade.EITHER, unknown=True)
     return out
+
+
+def _has_stopped(name: str, at_bounds: Sequence[str]) -> bool:
+    """Return whether a value of an effect, or of the thresholds beside it, ended where its search does."""
+    return any(text.startswith((f"{name}.", "threshold.")) for text in at_bounds)
 
 
 def leaves_little(start: Judgement, last: Judgement, settings: GradeSettings) -> bool:

@@ -123,10 +123,8 @@ class SeenEffects:
         Args:
             sensor: The last model.
         """
-        entry, bus = (
-            self.entry_of(FULL_BUS),
-            next((e for e in sensor.effects if isinstance(e, Readout)), None),
-        )
+        entry = self.entry_of(FULL_BUS)
+        bus = next((one for one in sensor.effects if isinstance(one, Readout)), None)
         ceiling = entry.details.get("rate", 0.0) if entry is not None else 0.0
         if bus is None or not ceiling:
             return self

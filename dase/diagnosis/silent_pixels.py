@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
+from dase.diagnosis.model_at_pixels import count_of_model
 from dase.effects.dead import Dead
-from dase.effects.stream import StreamEffect
 from dase.fitting.compared_time import common_grid, times_of_grid
 from dase.fitting.measurement import Measurement
 from dase.fitting.time_window import is_constant, within_span
@@ -27,7 +27,6 @@ from dase.results import DetectionLimit, Diagnosis, Estimate, Finding, Grade
 from dase.scenes.between_frames import CameraScene
 from dase.scenes.scene import Scene
 from dase.simulation.sensor import Sensor
-from dase.simulation.simulate import simulate
 
 NAME = Dead.name
 
@@ -191,16 +190,10 @@ def without_the_explained_silence(
     if not len(silent.pixels):
         return silent
     alive = sensor.without(NAME) if NAME in sensor else sensor
-    # a bus needs the events of all pixels, and leaves of these what tells of them
-    alive = replace(alive, effects=tuple(e for e in alive.effects if not isinstance(e, StreamEffect)))
-    size = measurement.events.width * measurement.events.height
     least = np.full(len(silent.pixels), np.inf)
     for turn in range(silent.settings.repeats):
         stream = SimulationStream.SILENT_PIXELS.seed(seed, turn)
-        made = simulate(measurement.scene, alive, seed=stream, pixels=silent.pixels)
-        made = replace(measurement, events=made).compared_events()
-        sent = np.bincount(made.y.astype(np.int64) * made.width + made.x, minlength=size)
-        least = np.minimum(least, sent[silent.pixels])
+        least = np.minimum(least, count_of_model(measurement, alive, silent.pixels, seed=stream))
     return replace(silent, pixels=silent.pixels[least > silent.settings.hardly])
 
 

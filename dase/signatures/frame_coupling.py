@@ -99,8 +99,8 @@ class _Folded:
         return out
 
 
-def _evened(counts: NDArray[np.uint32]) -> NDArray[np.float64]:
-    """Return the events of a polarity by step with each tile as heavy as its events are few, shape (K,).
+def _weigh_tiles(counts: NDArray[np.uint32]) -> NDArray[np.float64]:
+    """Return the events of a polarity by step, each tile weighted by one over its rate, shape (K,).
 
     What couples into all pixels alike is lost where a scene moves and stands out where none does: weights of
     one over a tile's rate give it the least variance. They are scaled so that the variance is the mean again.
@@ -127,7 +127,7 @@ def _fold(
     first: NDArray[np.int64],
     length: int,
     step: float,
-    evens: bool,
+    weighted: bool,
     s: CouplingSettings,
 ) -> _Folded | None:
     """Fold the counts of a polarity on the frames that begin at steps `first`, and test their common phase.
@@ -141,11 +141,11 @@ def _fold(
         first: Steps at which frames begin, shape (F,).
         length: Steps of a frame.
         step: Of the clock [s].
-        evens: Whether tiles weigh the more the fewer their events are.
+        weighted: Whether each tile is weighted by one over its rate.
         s: What counts as a burst.
     """
     total = counts.sum(1, dtype=np.float64)
-    weighed = _evened(counts) if evens else total
+    weighed = _weigh_tiles(counts) if weighted else total
     # bursts come some tenths of a millisecond early or late
     smooth = maximum_filter1d(np.convolve(weighed, np.ones(3) / 3, "same"), 3)
     usual = _usual_rate(weighed, step, s)
@@ -181,7 +181,7 @@ def _is_lamp(mean: NDArray[np.float64], at: int, step: float, s: CouplingSetting
 
 
 def _find_bursts(
-    counts: NDArray[np.uint32], step: float, high: float, evens: bool, s: CouplingSettings
+    counts: NDArray[np.uint32], step: float, high: float, weighted: bool, s: CouplingSettings
 ) -> list[NDArray[np.int64]]:
     """Return the steps of bursts of the whole array, OFF and ON: many tiles, and `high` times the usual."""
     out = []
@@ -191,8 +191,8 @@ def _find_bursts(
         plain = usual = _usual_rate(total, step, s)
         share = per_tile.mean(0) / max(per_tile.mean(), 1e-12) / per_tile.shape[1]
         active = share > 0.1 / len(share)
-        if evens:
-            total = _evened(counts[:, polarity])
+        if weighted:
+            total = _weigh_tiles(counts[:, polarity])
             usual = _usual_rate(total, step, s)
             active = per_tile.sum(0) >= s.fewest_events
         rows = np.flatnonzero((total > high * usual + 20) & (total - usual > 10 * np.sqrt(usual + 1)))
@@ -300,16 +300,16 @@ def find_frame_coupling(
     if begins is not None and len(begins) >= 2:
         frames = np.asarray(begins, np.float64), float(np.median(np.diff(begins))), None
     said: tuple[Signature, BurstClock | None] | None = None
-    for evens, high in product((False, True), s.high[:1] if frames else s.high):
-        if evens and said is not None and said[0].answer is Answer.CANNOT_SAY:
+    for weighted, high in product((False, True), s.high[:1] if frames else s.high):
+        if weighted and said is not None and said[0].answer is Answer.CANNOT_SAY:
             break
-        found = frames or _search_bursts(clock, high, evens, s)
-        entry = _look_in_step(clock, *found, evens, level, s) if found else _without_bursts(clock, s)
+        found = frames or _search_bursts(clock, high, weighted, s)
+        entry = _look_in_step(clock, *found, weighted, level, s) if found else _without_bursts(clock, s)
         if entry[0].found:
             return entry
         # what else is met by a lower limit, or where little moves, is not the frames'
         said = said or entry
-        if evens and entry[0].answer is Answer.CANNOT_SAY:
+        if weighted and entry[0].answer is Answer.CANNOT_SAY:
             break  # three swings of a lamp look like bursts of frames, once a scene no longer hides them
     assert said is not None
     return said
@@ -330,7 +330,7 @@ def _look_in_step(
     begins: NDArray[np.float64],
     interval: float,
     p: float | None,
-    evens: bool,
+    weighted: bool,
     level: float,
     s: CouplingSettings,
 ) -> tuple[Signature, BurstClock | None]:
@@ -341,7 +341,7 @@ def _look_in_step(
         begins: When frames begin [s], shape (F,).
         interval: Time from one to the next [s].
         p: Chance of bursts that tell as even times; None where frames tell them.
-        evens: Whether tiles weigh the more the fewer their events are.
+        weighted: Whether each tile is weighted by one over its rate.
         level: p below which they are there.
         s: What counts as a burst.
     """
@@ -353,7 +353,7 @@ def _look_in_step(
     length = round(interval / step)
     first = np.round((begins - clock.begin) / step).astype(np.int64)
     whole = (first >= 0) & (first + length <= len(counts))
-    folded = [_fold(counts[:, k], first[whole], length, step, evens, s) for k in range(2)]
+    folded = [_fold(counts[:, k], first[whole], length, step, weighted, s) for k in range(2)]
     known = [(k, f) for k, f in enumerate(folded) if f is not None]
     if not known:
         frames = int(whole.sum())
@@ -363,11 +363,11 @@ def _look_in_step(
 
 
 def _search_bursts(
-    clock: ClockCounts, high: float, evens: bool, s: CouplingSettings
+    clock: ClockCounts, high: float, weighted: bool, s: CouplingSettings
 ) -> tuple[NDArray[np.float64], float, float] | None:
     """Return times in step with bursts of the whole array [s], their interval [s], and its p."""
     best = None
-    for peaks in _find_bursts(clock.counts, clock.settings.step, high, evens, s):
+    for peaks in _find_bursts(clock.counts, clock.settings.step, high, weighted, s):
         if len(peaks) < s.fewest_frames:
             continue
         times = clock.times[peaks]
