@@ -62,12 +62,16 @@ def count_short_intervals(
     polarity: wp.array[wp.uint8],  # (N,) 1 for ON
     shared: wp.array[wp.uint8],  # (N,) 1 where many pixels send at that time
     edges: wp.array[wp.float64],  # (K,) [s], increasing, between which intervals are counted
+    late_edges: wp.array[wp.float64],  # (L,) [s], the same for late doubles, the last beyond those of `edges`
     # in and out
     last: wp.array[wp.float64],  # (H * W,) [s], when each pixel was last seen
     last_interval: wp.array[wp.float64],  # (H * W,) [s], from the event before to that
     last_polarity: wp.array[wp.uint8],  # (H * W,)
     count_out: wp.array4d[int],  # (3, K, 2, H * W): all intervals, those after a silence, and calm ones
     sum_out: wp.array[wp.float64],  # (K,) [s], of all intervals
+    late_out: wp.array3d[int],  # (3, L, 2): as `count_out`, of all pixels together
+    late_sum_out: wp.array[wp.float64],  # (L,) [s], of all intervals
+    late_of_pixels_out: wp.array[int],  # (H * W,): after a silence, from the second to the last but one edge
 ):
     """Count how often a pixel is soon seen again with the same polarity. Called with dim=1.
 
@@ -75,6 +79,8 @@ def count_short_intervals(
     last edge; calm is such an interval that ends at a time of its own.
     """
     far = edges[edges.shape[0] - 1]
+    beyond = late_edges.shape[0] - 1
+    late_far = late_edges[beyond]
     for i in range(time.shape[0]):
         place = pixel[i]
         sign = polarity[i]
@@ -89,6 +95,18 @@ def count_short_intervals(
                 count_out[1, kind, int(sign), place] += 1
                 if shared[i] == wp.uint8(0):
                     count_out[2, kind, int(sign), place] += 1
+        if sign == last_polarity[place] and interval < late_far:
+            late = int(0)
+            while interval >= late_edges[late]:
+                late += 1
+            late_out[0, late, int(sign)] += 1
+            late_sum_out[late] += interval
+            if last_interval[place] >= late_far:
+                late_out[1, late, int(sign)] += 1
+                if late > 1 and late < beyond:
+                    late_of_pixels_out[place] += 1
+                if shared[i] == wp.uint8(0):
+                    late_out[2, late, int(sign)] += 1
         last_interval[place] = interval
         last[place] = time[i]
         last_polarity[place] = sign

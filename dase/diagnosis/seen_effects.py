@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from dase.diagnosis.doubles_of_jumps import find_doubles_at_small_jumps
 from dase.diagnosis.frames_at_rest import events_where_frames_rest
 from dase.diagnosis.led_pixels import follow_the_light
+from dase.diagnosis.tone_of_light import is_tone_of_light
 from dase.effects import EFFECTS, Effect
 from dase.effects.high_pass import HighPass
 from dase.effects.made_signatures import makers_of, told_by
@@ -25,7 +26,7 @@ from dase.events import Events
 from dase.fitting.burst_strength import BurstStrength, burst_times_of, fit_bursts
 from dase.fitting.frame_steps import clip_step_of, frame_step_of, is_held, is_in_step, ticks_are_of_frames
 from dase.fitting.measurement import Measurement
-from dase.results import DetectionLimit, Diagnosis, Finding, Grade
+from dase.results import DetectionLimit, Diagnosis, Estimate, Finding, Grade
 from dase.scenes.between_frames import CameraScene
 from dase.scenes.scene import Scene
 from dase.scenes.video import VideoScene
@@ -58,6 +59,9 @@ search. What that lacks may have made them too high to see a lamp in the clip: a
 WEAK_TONE = 0.1
 """Swing of the rate below which a tone may be what bursts leave beside them; lamps swung it by 0.19 and more
 in 18 of 20 clips of other simulators in which one was seen."""
+
+FRAMES_STAMPED = 0.5
+"""Share of the frames of a clip at whose times packets are, from which on these are the frames."""
 
 ABOVE_CEILING = 4.0
 """Times a ceiling of the rate of events at which a bus must have nothing to do for it to be no bus's."""
@@ -341,12 +345,24 @@ def _is_of_frames(entry: Signature, step: float, events: Events, scene: Scene) -
         return True
     if entry.name == FRAME_COUPLING:
         return step > 0 and is_in_step(1 / entry.details["interval"], step)
+    if "packets" in entry.details:
+        return times_that_are_stamps(events, scene) > FRAMES_STAMPED
     said = entry.details if entry.name == TIME_STAMPS and "line" not in entry.details else {}
     period, gap = said.get("period", 0.0), clip_step_of(scene)
     if period and gap and is_in_step(1 / period, gap):
         return True  # of noise that is drawn once a frame, or of pixels that send some time after each
     tick = said.get("step", period)
     return ticks_are_of_frames(tick, step, events, scene)
+
+
+def times_that_are_stamps(events: Events, scene: Scene) -> float:
+    """Return the share of the instants of a scene at which there are events, to 2 us."""
+    times = scene.sample_times()
+    times = times[(times >= events.t[0]) & (times <= events.t[-1])]
+    if not len(times):
+        return 0.0
+    after = np.minimum(np.searchsorted(events.t, times - 2e-6), len(events) - 1)
+    return float(np.mean(events.t[after] <= times + 2e-6))
 
 
 def _are_led(entry: Signature, events: Events, scene: Scene) -> bool:
@@ -424,6 +440,10 @@ def without_the_scene(seen: SeenEffects, measurement: Measurement, sensor: Senso
         # a simulator that is late does not show that it has held a clip
         if is_held(scene) or doubles.answer is Answer.NOT_SEEN:
             seen = _with_doubles(seen, doubles)
+    if isinstance(scene, VideoScene):
+        tones = [one for one in seen.entries if one.name == FLICKER]
+        if any(is_tone_of_light(one, scene, log_eps=sensor.log_eps) for one in tones):
+            seen = replace(seen, entries=tuple(one for one in seen.entries if one not in tones))
     asked = _asked_of_scene(seen.entries, scene)
     if not asked:
         return seen
@@ -545,6 +565,28 @@ def with_effect_of_bursts(found: Diagnosis, strength: BurstStrength) -> Diagnosi
         errors=(*found.errors, found.errors[-1]),
         parameters={**found.parameters, **strength.parameters},
         findings=findings,
+    )
+
+
+def with_size_that_was_seen(diagnosis: Diagnosis, found: Signature, parameter: str) -> Diagnosis:
+    """Return a diagnosis in which a parameter has the size that was seen, where no fit gave one.
+
+    Args:
+        diagnosis: By the fits alone.
+        found: What shows the effect.
+        parameter: With its effect, `effect.name`.
+    """
+    if parameter in diagnosis.parameters:
+        return diagnosis
+    effect = parameter.partition(".")[0]
+    mine: Mapping[str, Estimate] = {parameter: Estimate(found.size, found.low, found.high)}
+    return replace(
+        diagnosis,
+        parameters={**diagnosis.parameters, **mine},
+        findings=tuple(
+            replace(one, parameters=mine) if one.effect == effect and not one.parameters else one
+            for one in diagnosis.findings
+        ),
     )
 
 

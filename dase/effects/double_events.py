@@ -73,8 +73,8 @@ class DoubleEvents(StreamEffect):
     """Events that are sent twice.
 
     Where the handshake between a pixel and its arbiter is slow, a pixel asks again before it is reset: an
-    event has a double of the same pixel and polarity a microsecond or two later (some ten where a
-    simulator makes them; up to 80 are looked for). In two recordings of a
+    event has a double of the same pixel and polarity a microsecond or two later (some ten to some hundred
+    where a simulator makes them; up to 640 are looked for). In two recordings of a
     DVS128 2.3 and 3.2 % of the events are such doubles, within 2 us, nearly all of them OFF; in one of a
     DAVIS240B 0.4 %, after 1 to 5 us. They tell nothing of the light, and count in all rates.
 

@@ -13,6 +13,10 @@ polarities have them and hardly anything else comes within hundreds of microseco
 
 A slow handshake is answered twice only after some ten microseconds. What is as late could be two steps of a
 fast rise as well. So it counts where hardly any is later, and hardly ever two in a row.
+
+Some simulations have doubles some hundred microseconds late, which is what edges do, too, but at all times
+from event to event. So these are doubles where hardly any event is sooner or later than they are, of either
+polarity, up to milliseconds, and where the pixel was silent as long before.
 """
 
 from __future__ import annotations
@@ -60,6 +64,22 @@ class DoubleSettings:
     alone: float = 0.9
     """Share of slow doubles, at least, before whose first event the pixel was silent for `far`."""
 
+    late: tuple[float, ...] = (160e-6, 320e-6, 640e-6)
+    """[s] Ends of what is looked at for late ones, which begins at a quarter of it."""
+
+    late_far: float = 1.6e-3
+    """[s] Up to which others are counted, and for which pixels were silent before late doubles."""
+
+    late_sooner: float = 0.2
+    """Intervals that are shorter than late doubles, relative to these, at most."""
+
+    late_later: float = 0.2
+    """The same of longer ones, up to `late_far`. Two steps of a jump behind a fast low-pass are as alike, but
+    come after each frame: frames come sooner than the pixel would have to be silent before."""
+
+    late_usual: float = 0.5
+    """Share of late doubles, at least, of other pixels than the busiest, those beyond `bulk`."""
+
     off_clock: float = 2.0
     """Events at times that few pixels share per double, at most, where the clock is slower than doubles: on
     such a clock the second of a double alone has another time."""
@@ -86,6 +106,16 @@ class IntervalCounts:
         """
         self.sums = np.zeros(len(self.edges))
         """Of all intervals below the first edge and between edges [s], shape (K,)."""
+        self.late_edges = np.array(
+            [s.tie, 0.25 * s.late[0], *(0.5 * end for end in s.late), s.late[-1], s.late_far]
+        )
+        """The same of late doubles, shape (L,)."""
+        self.late = np.zeros((3, len(self.late_edges), 2), np.int32)
+        """As `counts`, of all pixels together, and after a silence of `late_far`, shape (3, L, 2)."""
+        self.late_sums = np.zeros(len(self.late_edges))
+        """As `sums`, shape (L,)."""
+        self.late_of_pixels = np.zeros(width * height, np.int32)
+        """Intervals that are late doubles if there are any."""
         self.events = np.zeros((2, width * height), np.int64)
         """OFF and ON events."""
         self.at_own_times = 0
@@ -128,9 +158,10 @@ class IntervalCounts:
             (events.t, wp.float64), (pixel, int), (events.p.astype(np.uint8), wp.uint8),
             (shared.astype(np.uint8), wp.uint8),
             # whole microseconds as floating point numbers: 20 of them are not less than 20
-            (self.edges - 1e-9, wp.float64),
+            (self.edges - 1e-9, wp.float64), (self.late_edges - 1e-9, wp.float64),
             (self._last, wp.float64), (self._interval, wp.float64), (self._polarity, wp.uint8),
             (self.counts, int), (self.sums, wp.float64),
+            (self.late, int), (self.late_sums, wp.float64), (self.late_of_pixels, int),
         )  # fmt: skip
         arrays = [wp.array(a, dtype=d, device=self._cpu, copy=False) for a, d in columns]
         wp.launch(count_short_intervals, dim=1, inputs=arrays, device=self._cpu)
@@ -164,7 +195,8 @@ def find_double_events(
     The null has as many intervals per second below 20 µs as from there to 400 µs: binomial. It must fail for
     pairs of OFF events before which the pixel was silent for 400 µs and whose second does not share its time
     with many pixels, and without the busiest pixels, too: where thresholds differ, a few send dozens at a
-    jump. Where it does not fail, 40 and 80 µs take the place of 20.
+    jump. Where it does not fail, 40 and 80 µs take the place of 20, and after these late doubles are looked
+    for.
 
     Args:
         intervals: Counted intervals.
@@ -175,7 +207,8 @@ def find_double_events(
     """
     s = intervals.settings
     if tick >= s.near and not _leave_the_clock(intervals, hot):
-        return without_answer(
+        late = _look_for_late(intervals, hot, level, tick)
+        return late or without_answer(
             DOUBLE_EVENTS, f"stamps are {format_seconds(tick)} apart, which hides what is sooner"
         )
     count = intervals.events.sum(0)
@@ -193,7 +226,7 @@ def find_double_events(
         slow = _look_within(intervals, reach, totals, level)
         if slow.found:
             return slow
-    return soon
+    return _look_for_late(intervals, hot, level, tick) or soon
 
 
 @dataclass(frozen=True)
@@ -246,6 +279,62 @@ def _look_within(intervals: IntervalCounts, reach: int, totals: Sequence[_Totals
         reason = f"{format_percent(ties / events)} of the events come at the time of the same pixel's last"
         return replace(found, answer=Answer.CANNOT_SAY, sentence=f"{reason}: a delay or a slow clock")
     return found
+
+
+def _look_for_late(
+    intervals: IntervalCounts, hot: NDArray[np.bool_], level: float, tick: float
+) -> Signature | None:
+    """Return late doubles; None where there are none.
+
+    The null has as many intervals per second from a quarter of an end to it as from there to `late_far`:
+    binomial, for either polarity, after silences, at times that few pixels share.
+
+    Args:
+        intervals: Counted intervals.
+        hot: Pixels to leave out, shape (H * W,).
+        level: p below which they are there.
+        tick: Time between the ticks of the stamps, or from scan to scan [s]: intervals are multiples of it.
+    """
+    s, events = intervals.settings, intervals.events.sum(1)
+    of_pixels = intervals.late_of_pixels
+    count = intervals.events.sum(0)
+    usual = ~hot & (count <= np.quantile(count[~hot], s.bulk))
+    if int(of_pixels[usual].sum()) < s.late_usual * int(of_pixels.sum()):
+        return None
+    for number, end in enumerate(s.late, 3):
+        if tick >= 0.25 * end:
+            continue
+        near, later, sooner = (
+            intervals.late[:, part].sum(1)
+            for part in (slice(number - 1, number + 1), slice(number + 1, None), slice(1, number - 1))
+        )
+        every, silent, calm = near  # OFF and ON
+        if (
+            np.any(calm < np.maximum(s.least * events, 20))
+            or np.any(later[2] > s.late_later * calm)
+            or np.any(sooner[2] > s.late_sooner * calm)
+            or np.any(silent < s.alone * every)
+        ):
+            continue
+        chance = 0.75 * end / (s.late_far - 0.25 * end)
+        p = float(stats.binom.sf(calm - 1, calm + later[2], chance).max()) * len(s.late)
+        number_of, total = int(every.sum()), int(events.sum())
+        part = format_percent(number_of / total)
+        low, high = (limit / total for limit in poisson_interval(number_of))
+        gap = float(intervals.late_sums[number - 1 : number + 1].sum() / number_of)
+        begins, ends, far = (format_seconds(time) for time in (0.25 * end, end, s.late_far))
+        others = f"{format_count(int(later[0].sum()))} from there to {far}"
+        found = Signature(
+            name=DOUBLE_EVENTS, answer=Answer.NOT_SEEN, p=p, size=number_of / total, low=low, high=high,
+            unit="share of the events", least=s.least,
+            sentence=f"{format_count(number_of)} events ({part}) {begins} to {ends} "
+            f"after the same pixel's last of the same polarity, {others}",
+            details={"near": number_of, "later": int(later[0].sum()), "at_once": 0, "gap": gap},
+        )  # fmt: skip
+        judged = judge_signature(found, level, "")
+        if judged.found:
+            return judged
+    return None
 
 
 def _leave_the_clock(intervals: IntervalCounts, hot: NDArray[np.bool_]) -> bool:

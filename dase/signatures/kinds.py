@@ -23,6 +23,7 @@ UNEQUAL_THRESHOLDS = "unequal thresholds"
 DRIFTING_MEMORY = "drifting memory"
 REDRAWN_THRESHOLDS = "redrawn thresholds"
 LATE_EVENTS = "late events"
+LARGER_STEPS_IN_THE_DARK = "larger steps in the dark"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,7 +36,7 @@ class SignatureKind:
         ways: Details that only some of these signatures have, by which they tell effects apart: of time
             stamps the time between ticks or that of a line [s], of noise the share of successive events that
             are opposite, where these are independent or return, of late events by how much they are, or the
-            poles that light is behind.
+            poles that light is behind, of larger steps in the dark the current or the knee that makes them.
         beside_model: Whether it is what a model over the same scene lacks: events alone do not show it.
         whatever_fits: Whether it is there however badly that model fits.
         of_light: Whether light makes it by itself: a scene may show it to any sensor, and an effect that
@@ -67,7 +68,7 @@ KINDS: dict[str, SignatureKind] = {
         SignatureKind(name=FULL_BUS, about="the event rate has a ceiling, or events keep a distance in time"),
         SignatureKind(
             name=TIME_STAMPS,
-            about="times are multiples of a step, or lines of pixels are read in turn",
+            about="times are multiples of a step or those of packets, or lines of pixels are read in turn",
             ways=("step", "line"),
         ),
         SignatureKind(name=OPPOSITE_PAIRS, about="pixels at rest send an event and then its opposite"),
@@ -115,6 +116,13 @@ KINDS: dict[str, SignatureKind] = {
             about="light goes equally far between two events some time before these, or behind poles",
             ways=("delay", "pole", "poles"),
             beside_model=True,
+        ),
+        SignatureKind(
+            name=LARGER_STEPS_IN_THE_DARK,
+            about="the darker it is, the farther light goes between two events",
+            ways=("current", "knee"),
+            beside_model=True,
+            whatever_fits=True,
         ),
     )
 }

@@ -458,6 +458,44 @@ def test_slow_doubles_show_where_nothing_is_later(rng, low, slowest, shown):
         assert entry.details["gap"] == pytest.approx(50e-6, rel=0.05)
 
 
+@pytest.mark.parametrize(
+    ("share", "gap", "third", "shown"), [(0.05, 260, 0, True), (0.05, 260, 1, False), (0, 0, 0, False)]
+)
+def test_late_doubles_show_where_nothing_is_sooner_or_later(rng, share, gap, third, shown):
+    """Some hundred microseconds late; a third event after as long again is that of an edge."""
+    t, pixel = rng.uniform(0, 20e6, 60_000), rng.integers(0, 900, 60_000)
+    again = np.flatnonzero(rng.random(len(t)) < share)
+    late = gap * rng.uniform(0.6, 1.4, len(again))
+    seconds = [t[again] + late] + third * [t[again] + 4 * late]
+    t = np.round(np.concatenate([t, *seconds]))
+    pixel = np.concatenate([pixel, *(pixel[again] for _ in seconds)])
+    order = np.argsort(t, kind="stable")
+    x, y = ((pixel[order] % 30).astype(np.uint16), (pixel[order] // 30).astype(np.uint16))
+    entry = dase.find_signatures(Events(t[order] * 1e-6, x, y, pixel[order] % 3 > 0, 30, 30))["double events"]
+    assert entry.found == shown
+    if shown:
+        assert "after the same pixel's last" in entry.sentence
+        assert entry.details["gap"] == pytest.approx(gap * 1e-6, rel=0.05)
+        assert entry.size == pytest.approx(share / (1 + share), rel=0.05)
+
+
+@pytest.mark.parametrize(
+    ("frames", "shown"),
+    [(None, True), ([1000], False), ([250, 333, 500, 1000], False), ([120, 170, 260], False)],
+)
+def test_packets_of_a_clock_show_and_not_frames_or_parts_of_them(rng, frames, shown):
+    """A packet has what was sent since the last one; the parts of a frame have gaps that come again."""
+    gaps = 3500 * rng.gamma(2, 0.5, 700) if frames is None else rng.choice(frames, int(2e6 / np.mean(frames)))
+    ends = np.cumsum(np.rint(gaps) + 1)
+    t = np.sort(rng.uniform(0, ends[-1], 60_000))
+    t = ends[np.searchsorted(ends, t)]
+    pixel = rng.integers(0, 900, len(t))
+    x, y = (pixel % 30).astype(np.uint16), (pixel // 30).astype(np.uint16)
+    entry = dase.find_signatures(Events(t * 1e-6, x, y, pixel % 3 > 0, 30, 30))["time stamps"]
+    assert ("packets" in entry.details) == shown
+    assert not shown or (entry.found and entry.details["step"] == pytest.approx(2.9e-3, rel=0.15))
+
+
 @pytest.mark.parametrize(("share", "noise", "shown"), [(0.05, 0, True), (0.0, 0, False), (0.0, 4, False)])
 def test_doubles_show_that_leave_a_slow_clock(rng, share, noise, shown):
     """All stamps but those of the second of doubles are whole milliseconds; spread ticks tell nothing."""
