@@ -33,13 +33,14 @@ from dase.diagnosis.seen_effects import (
     SeenEffects,
     part_to_simulate,
     with_effect_of_bursts,
+    with_size_that_was_seen,
     without_the_scene,
 )
 from dase.diagnosis.settings import DEFAULTS, DiagnosisSettings
 from dase.diagnosis.silent_pixels import with_dead_pixels, without_the_explained_silence
 from dase.diagnosis.state import DiagnosisState, DiagnosisTask
+from dase.diagnosis.steps_in_the_dark import OF_WAYS
 from dase.diagnosis.unequal_thresholds import EFFECT as MISMATCH
-from dase.diagnosis.unequal_thresholds import with_unequal_thresholds
 from dase.effects import EFFECTS, Effect
 from dase.effects.jitter import Jitter
 from dase.effects.optics_blur import OpticsBlur
@@ -59,7 +60,13 @@ from dase.probes.random_streams import SimulationStream
 from dase.probes.stimulus import Trust
 from dase.results import Diagnosis, Progress, is_worse
 from dase.scenes.grey_steps import grey_step_of
-from dase.signatures.kinds import DEAD_TIME, DOUBLE_EVENTS, OPPOSITE_PAIRS, UNEQUAL_THRESHOLDS
+from dase.signatures.kinds import (
+    DEAD_TIME,
+    DOUBLE_EVENTS,
+    LARGER_STEPS_IN_THE_DARK,
+    OPPOSITE_PAIRS,
+    UNEQUAL_THRESHOLDS,
+)
 from dase.simulation.sensor import Sensor
 from dase.simulation.sensor_file import as_sensor
 
@@ -287,7 +294,11 @@ def _with_what_pixels_show(
     if not contradicted:
         found = with_direct_readings(found, task, measurement)
     if unequal is not None and MISMATCH in task.effects:
-        found = with_unequal_thresholds(found, unequal)
+        found = with_size_that_was_seen(found, unequal, f"{MISMATCH}.spread")
+    darker = seen.entry_of(LARGER_STEPS_IN_THE_DARK)
+    for way, (effect, parameter) in OF_WAYS.items():
+        if darker is not None and way in darker.details and effect in task.effects:
+            found = with_size_that_was_seen(found, darker, f"{effect}.{parameter}")
     silent = compared.silent
     if silent is not None and silent.decides and not contradicted:
         silent = without_the_explained_silence(silent, measurement, model.sensor, seed=task.seed)

@@ -79,6 +79,10 @@ class RedrawnSettings:
     worse: float = 0.1
     """By how much the held-out error may rise with a jitter that is seen."""
 
+    unlike: float = 2.0
+    """Times the spread that fits that it may be: 0.8 to 1.1 in nine cases with a jitter, 5.6 beside doubles a
+    quarter of a millisecond late."""
+
     runs: int = 300
     """Runs of four events of a polarity, at least."""
 
@@ -341,6 +345,19 @@ def runs_of(
     return out
 
 
+def is_unlike_fit(found: Signature, sensor: Sensor, settings: RedrawnSettings = REDRAWN) -> bool:
+    """Return whether thresholds seem to differ far more from event to event than in the model that fits.
+
+    Args:
+        found: By how much they differ.
+        sensor: The model, with a jitter.
+        settings: How much more is too much.
+    """
+    jitter = sensor[EFFECT]
+    assert isinstance(jitter, Jitter)
+    return found.size > settings.unlike * jitter.spread
+
+
 def add_jitter(
     task: DiagnosisTask,
     model: FittedModel,
@@ -348,7 +365,7 @@ def add_jitter(
     found: Signature,
     settings: RedrawnSettings = REDRAWN,
 ) -> Candidate | None:
-    """Return a model with the jitter that was seen, fitted and judged; None where it is worse with it.
+    """Return a model with the jitter that was seen, fitted and judged; None where it is worse or unlike that.
 
     Args:
         task: What the diagnosis is asked.
@@ -360,6 +377,6 @@ def add_jitter(
     sensor = with_fixed_effect(model, Jitter(spread=min(found.size, 1.0))).sensor
     fitted = refit_model(task.evidence, with_same_freedom(sensor, model, (EFFECT,)), seed=task.seed, rounds=1)
     judged = task.judge(fitted)
-    if judged.error > judgement.error + settings.worse:
+    if judged.error > judgement.error + settings.worse or is_unlike_fit(found, fitted.sensor, settings):
         return None
     return Candidate(EFFECT, fitted, fitted.loss, judgement=judged)

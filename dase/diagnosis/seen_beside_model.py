@@ -1,8 +1,9 @@
 """What the events show beside a model over the scene, however badly that fits.
 
 Noise and leaks show by what pixels send while their light rests, a dead time by where the intervals of pixels
-end, thresholds that differ or drift by how far light goes from one event to the next: each against a
-simulation of the model. What events show without any model is in `dase.diagnosis.seen_effects`.
+end, thresholds that differ or drift, a dark current and a knee by how far light goes from one event to the
+next: each against a simulation of the model. What events show without any model is in
+`dase.diagnosis.seen_effects`.
 """
 
 from __future__ import annotations
@@ -17,9 +18,11 @@ from dase.diagnosis.events_at_rest import find_events_at_rest, noise_is_a_patter
 from dase.diagnosis.late_light import find_late_events, time_of_delay
 from dase.diagnosis.light_between_events import LightBetweenEvents
 from dase.diagnosis.redrawn_thresholds import EFFECT as JITTER
-from dase.diagnosis.redrawn_thresholds import find_jitter_beside
+from dase.diagnosis.redrawn_thresholds import find_jitter_beside, is_unlike_fit
 from dase.diagnosis.seen_effects import SeenEffects
 from dase.diagnosis.state import DiagnosisState, DiagnosisTask, EventsAlone, with_same_freedom
+from dase.diagnosis.steps_in_the_dark import MAKERS as DARKER
+from dase.diagnosis.steps_in_the_dark import find_larger_steps_in_the_dark
 from dase.diagnosis.unequal_thresholds import EFFECT as MISMATCH
 from dase.diagnosis.unequal_thresholds import find_unequal_thresholds
 from dase.effects import EFFECTS
@@ -60,6 +63,7 @@ def look_beside_model(
     seen = _look_where_light_rests(task, seen, measurement, model)
     seen = _look_for_dead_time(task, seen, measurement, model)
     seen = _look_at_thresholds(task, seen, measurement, model)
+    seen = _look_at_steps_in_the_dark(task, seen, measurement, model)
     seen = _look_for_late_events(task, seen, measurement, model)
     seen = _without_pattern_of_noise(state, seen, measurement, model)
     certain = frozenset(seen.effects) & frozenset(task.effects) - task.given
@@ -151,7 +155,9 @@ def settle_jitter(
     if JITTER not in task.added_to(model) or seen.lamp or task.evidence.frame_step or seen.full_bus:
         return seen
     found = find_jitter_beside(measurement, model, judgement, noise=events_alone.noise, seed=task.seed)
-    return seen if found is None else replace(seen, entries=(*seen.entries, found))
+    if found is None or is_unlike_fit(found, model.sensor):
+        return seen
+    return replace(seen, entries=(*seen.entries, found))
 
 
 def _look_where_light_rests(
@@ -205,6 +211,16 @@ def _look_at_thresholds(
         structure = task.evidence.structure
         found.append(find_drifting_memory(light, model.sensor, structure=structure, seed=task.seed))
     return replace(seen, entries=(*seen.entries, *(one for one in found if one is not None)))
+
+
+def _look_at_steps_in_the_dark(
+    task: DiagnosisTask, seen: SeenEffects, measurement: Measurement, model: FittedModel
+) -> SeenEffects:
+    """Return what is seen, with by how much farther light goes between two events in the dark, if it does."""
+    if task.evidence.contradiction or seen.lamp or task.given.intersection(DARKER):
+        return seen
+    found = find_larger_steps_in_the_dark(measurement, model.sensor, seed=task.seed)
+    return seen if found is None else replace(seen, entries=(*seen.entries, found))
 
 
 def _look_for_late_events(

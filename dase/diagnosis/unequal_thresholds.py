@@ -13,8 +13,7 @@ model with equal thresholds over the same scene must not show it either.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +23,6 @@ from dase.effects.mismatch import Mismatch
 from dase.errors import InputError
 from dase.formatting import format_percent
 from dase.probes.random_streams import SimulationStream
-from dase.results import Diagnosis, Estimate
 from dase.signatures import kinds
 from dase.signatures.chance import NINETY, sign_flip_tail
 from dase.signatures.result import Answer, Signature
@@ -244,19 +242,3 @@ def _sum_blocks(field: Array, block: int) -> Array:
     padded[: field.shape[0], : field.shape[1]] = field
     out: Array = padded.reshape(height // block, block, width // block, block).sum((1, 3)).reshape(-1)
     return out
-
-
-def with_unequal_thresholds(diagnosis: Diagnosis, found: Signature) -> Diagnosis:
-    """Return a diagnosis in which the spread that was seen has its size, where no fit gave one."""
-    name = f"{EFFECT}.spread"
-    if name in diagnosis.parameters:
-        return diagnosis
-    mine: Mapping[str, Estimate] = {name: Estimate(found.size, found.low, found.high)}
-    return replace(
-        diagnosis,
-        parameters={**diagnosis.parameters, **mine},
-        findings=tuple(
-            replace(one, parameters=mine) if one.effect == EFFECT and not one.parameters else one
-            for one in diagnosis.findings
-        ),
-    )

@@ -9,6 +9,7 @@ from typing import ClassVar, Self
 import warp as wp
 
 from dase.effects.base import Effect, Observations, choice, parameter
+from dase.effects.made_signatures import Makes
 from dase.kernels.vector_math import exponential
 
 
@@ -48,7 +49,7 @@ class Dark(Effect):
         "Nozaki, Delbruck: Temperature and parasitic photocurrent effects in dynamic vision sensors, 2017"
     )
     stages: ClassVar = {"current": add_dark_current}
-    signatures: ClassVar = ()
+    signatures: ClassVar = (Makes("larger steps in the dark", tells=True, by="current", absence=False),)
     screen_limits: ClassVar = {
         "": (
             "dark current wants a lens cap: black of a screen is some 0.1 % of white, and the room adds to it"

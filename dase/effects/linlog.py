@@ -8,6 +8,7 @@ from typing import ClassVar
 import warp as wp
 
 from dase.effects.base import Effect, parameter
+from dase.effects.made_signatures import Makes
 from dase.kernels.vector_math import exponential, logarithm
 
 
@@ -40,7 +41,7 @@ class Linlog(Effect):
         "Hu, Liu, Delbruck: v2e, from video frames to realistic DVS events, 2021 (lin-log mapping)"
     )
     stages: ClassVar = {"respond": linlog_voltage}
-    signatures: ClassVar = ()
+    signatures: ClassVar = (Makes("larger steps in the dark", tells=True, by="knee", absence=False),)
     screen_limits: ClassVar = {
         "": "the knee wants light far below a screen's black: a lamp and grey filters over four decades",
     }

@@ -55,6 +55,8 @@ class SimulationStream(Enum):
     """Events of a model at pixels that are silent; a turn is a repeat."""
     HOT_PIXELS = (2700, 0)
     """Events of a model at pixels that seem to be hot."""
+    STEPS_IN_THE_DARK = (2900, 0)
+    """Events of a model whose response is the logarithm of light alone."""
     STIMULUS = (0, 1000)
     """Standard recordings; a turn is a stimulus."""
     RECORDING = (1, 500_000)

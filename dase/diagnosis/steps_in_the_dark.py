@@ -1,0 +1,241 @@
+"""Whether light goes the farther from one event of a pixel to the next the darker it is, and by which law.
+
+Between two events of a polarity a pixel's own signal goes by a threshold, in the dark as in the light. Where
+a current without light adds to the photocurrent, or the response is linear below a knee, the logarithm of the
+scene's light goes farther than that in the dark. So a current, or a knee, is sought with which the medians of
+steps are the same at all levels of light. No model is fitted: thresholds may be any, and differ from pixel to
+pixel and from event to event, and noise and leaks, which add some events to all, hardly move a median.
+
+What else makes steps differ, frames in step with which all events come, a low-pass or a dead time, does so by
+no such law: it counts only if next to nothing is left of what they differ by, and by one of the two alone.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize_scalar
+
+from dase.diagnosis.light_between_events import LightBetweenEvents, LightSteps, StepSettings
+from dase.effects.dark import Dark
+from dase.effects.linlog import Linlog
+from dase.errors import InputError
+from dase.fitting.frame_steps import is_held
+from dase.fitting.measurement import Measurement
+from dase.formatting import format_percent
+from dase.probes.random_streams import SimulationStream
+from dase.signatures.chance import NINETY
+from dase.signatures.kinds import LARGER_STEPS_IN_THE_DARK
+from dase.signatures.result import Answer, Signature
+from dase.simulation.sensor import Sensor
+
+Array = NDArray[np.float64]
+
+OF_WAYS = {"current": (Dark.name, "current"), "knee": (Linlog.name, "knee")}
+"""Way to the effect and its parameter."""
+
+MAKERS = tuple(effect for effect, _ in OF_WAYS.values())
+
+LOOKED_AT = StepSettings(darkest=0.015, samples=8_000_000, events=300_000)
+"""Pixels, instants and events; light far below that of steps that count, or these would be the short ones."""
+
+
+@dataclass(frozen=True)
+class DarkStepSettings:
+    """When steps are larger in the dark.
+
+    Chosen on six sets of other simulators (development).
+    """
+
+    darkest: float = 0.06
+    """Middle of a step that counts, relative to the brightest light, at least."""
+
+    bins: int = 8
+    """Levels of light, with as many steps in each."""
+
+    least: float = 0.012
+    """What the medians of steps differ by at different levels, relative, at least."""
+
+    left: float = 0.25
+    """Share of that which stays beside the current or the knee, at most."""
+
+    decided: float = 2.0
+    """Times as much that stays beside the other of the two, at least."""
+
+    current: tuple[float, float] = (0.004, 2.0)
+    """Currents that are looked for, relative to the brightest light."""
+
+    knee: tuple[float, float] = (0.04, 0.8)
+    """Knees that are."""
+
+    looks: int = 24
+    """At either, to begin with."""
+
+    steps: int = 2000
+    """Of either polarity, at least."""
+
+    longest: float = 0.05
+    """Time of one that counts, at most [s]: noise and leaks grow with time."""
+
+    model: float = 0.5
+    """What a model without either may show, relative to what is seen."""
+
+    groups: int = 8
+    """Of pixels, whose currents tell how well it is known."""
+
+    known: float = 0.08
+    """Error of a size beside chance, relative: light between frames is a guess. Six were 1 to 6 % off."""
+
+
+DARK_STEPS = DarkStepSettings()
+
+
+@dataclass(frozen=True, eq=False)
+class _Steps:
+    """Steps of one polarity: log intensity less that of the brightest light, before and after, shape (N,)."""
+
+    before: Array
+    after: Array
+    sign: int
+    pixel: NDArray[np.int64]
+
+    def part(self, group: int, groups: int) -> _Steps:
+        """Return those of every so many pixels."""
+        mine = self.pixel % groups == group
+        return _Steps(self.before[mine], self.after[mine], self.sign, self.pixel[mine])
+
+    def differ(self, response: Callable[[Array], Array], bins: int) -> float:
+        """Return what the medians of steps of a response differ by at different levels, relative."""
+        level = self.before + self.after
+        at = np.searchsorted(np.quantile(level, np.arange(1, bins) / bins), level)
+        moved = self.sign * (response(self.after) - response(self.before))
+        medians = np.array([np.median(moved[at == n]) for n in range(bins)])
+        mean = float(medians.mean())
+        return float(medians.std()) / mean if mean > 0 else math.inf
+
+
+@dataclass(frozen=True)
+class _Law:
+    """How the response departs from the logarithm: a current or a knee, relative to the brightest light."""
+
+    name: str
+    size: float
+    left: float
+
+
+def _with_current(size: float) -> Callable[[Array], Array]:
+    return lambda v: np.log(np.exp(v) + size)
+
+
+def _with_knee(size: float) -> Callable[[Array], Array]:
+    top = math.log(size)
+    return lambda v: np.where(v > top, v, top + np.exp(np.minimum(v - top, 0.0)) - 1)
+
+
+LAWS = {"current": _with_current, "knee": _with_knee}
+
+
+def find_larger_steps_in_the_dark(
+    measurement: Measurement,
+    sensor: Sensor,
+    *,
+    seed: int,
+    settings: DarkStepSettings = DARK_STEPS,
+) -> Signature | None:
+    """Return by which current or knee steps are larger in the dark; None where they are not, or by neither.
+
+    Args:
+        measurement: Its light is known, and not held.
+        sensor: The model, taken without either.
+        seed: Of its random numbers.
+        settings: When steps are larger.
+    """
+    if is_held(measurement.scene):
+        return None
+    light = LightBetweenEvents.of(measurement, log_eps=sensor.log_eps, settings=LOOKED_AT)
+    if light is None:
+        return None
+    brightest = float(np.quantile(light.level[:: max(1, len(light.level) // 50)], 0.99))
+    seen = _steps_of(light.seen, brightest, settings)
+    law, differ = _law_of(seen, settings), _differ(seen, None, settings)
+    if law is None:
+        return None
+    for name in MAKERS:
+        sensor = sensor.without(name) if name in sensor else sensor
+    try:
+        made = light.of_model(sensor, seed=SimulationStream.STEPS_IN_THE_DARK.seed(seed))
+    except InputError:
+        return None
+    modelled = _law_of(_steps_of(made, brightest, settings), settings)
+    if modelled is not None and modelled.size > settings.model * law.size:
+        return None
+    unit = math.exp(brightest)
+    size = unit * law.size
+    error = math.hypot(NINETY * unit * _error_of(seen, law, settings), settings.known * size)
+    what = "a current without light" if law.name == "current" else "a response that is linear below a knee"
+    then, at_once = format_percent(law.left), format_percent(differ)
+    sentence = (
+        f"light goes the farther from one event of a pixel to the next the darker it is, as with {what} of "
+        f"{size:.3g}: medians then differ by {then}, and by {at_once} without"
+    )
+    return Signature(
+        name=LARGER_STEPS_IN_THE_DARK, answer=Answer.FOUND, p=0.0, size=size, low=max(size - error, 0.0),
+        high=size + error, unit="intensity", least=settings.current[0] * unit, sentence=sentence,
+        details={law.name: size},
+    )  # fmt: skip
+
+
+def _steps_of(steps: LightSteps, brightest: float, settings: DarkStepSettings) -> list[_Steps]:
+    """Return the steps that count, of ON and OFF events that follow one of the same polarity; none if few."""
+    out = []
+    for sign in (1, -1):
+        counts = steps.counts & steps.again & (steps.gap < settings.longest) & (steps.on == (sign > 0))
+        counts &= steps.level - 0.5 * steps.change > brightest + math.log(settings.darkest)
+        after = steps.level[counts] - brightest
+        if len(after) < settings.steps:
+            return []
+        out.append(_Steps(after - steps.change[counts], after, sign, steps.pixel[counts]))
+    return out
+
+
+def _differ(steps: list[_Steps], response: Callable[[Array], Array] | None, s: DarkStepSettings) -> float:
+    """Return what steps of either polarity differ by at different levels, of a response or the logarithm."""
+    if not steps:
+        return 0.0
+    return max(one.differ(response or (lambda v: v), s.bins) for one in steps)
+
+
+def _law_of(steps: list[_Steps], settings: DarkStepSettings) -> _Law | None:
+    """Return the law by which steps are larger in the dark; None where they are not, or by neither of two."""
+    differ = _differ(steps, None, settings)
+    if not settings.least <= differ < math.inf:
+        return None
+    best, other = sorted((_fit(steps, name, settings) for name in LAWS), key=lambda one: one.left)
+    if best.left > settings.left * differ or other.left < settings.decided * best.left:
+        return None
+    return best
+
+
+def _fit(steps: list[_Steps], name: str, settings: DarkStepSettings) -> _Law:
+    """Return the size of a current or a knee with which steps differ least."""
+    low, high = settings.current if name == "current" else settings.knee
+
+    def left(log: float) -> float:
+        return _differ(steps, LAWS[name](math.exp(log)), settings)
+
+    tried = np.linspace(math.log(low), math.log(high), settings.looks)
+    begin = int(np.argmin([left(one) for one in tried]))
+    ends = tried[max(begin - 1, 0)], tried[min(begin + 1, len(tried) - 1)]
+    found = minimize_scalar(left, bounds=ends, method="bounded", options={"xatol": 0.01})
+    return _Law(name, math.exp(float(found.x)), float(found.fun))
+
+
+def _error_of(steps: list[_Steps], law: _Law, settings: DarkStepSettings) -> float:
+    """Return the standard error of a size, by those of groups of pixels, relative to the brightest light."""
+    parts = [[one.part(n, settings.groups) for one in steps] for n in range(settings.groups)]
+    sizes = [_fit(part, law.name, settings).size for part in parts]
+    return float(np.std(sizes, ddof=1)) / math.sqrt(len(sizes))

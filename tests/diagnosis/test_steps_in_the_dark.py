@@ -1,0 +1,106 @@
+"""A dark current and a knee are told by how much farther light goes from event to event in the dark."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers.frame_simulator import shaken_texture
+
+import dase
+from dase.diagnosis.seen_effects import with_size_that_was_seen
+from dase.diagnosis.steps_in_the_dark import DARK_STEPS, find_larger_steps_in_the_dark
+from dase.effects import EFFECTS
+from dase.effects.made_signatures import told_by
+from dase.fitting.measurement import Measurement
+from dase.scenes.video import VideoScene
+from dase.signatures.kinds import KINDS, LARGER_STEPS_IN_THE_DARK
+from dase.simulation.sensor import Sensor
+
+
+def sensor_with(**effects):
+    """Return a sensor with effects, each a dict of its values."""
+    sensor = Sensor()
+    for name, values in effects.items():
+        sensor = sensor.with_effect(EFFECTS[name](**values))
+    return sensor
+
+
+@pytest.fixture(scope="module")
+def scene():
+    """Return a texture that shakes, a tenth as bright on the left as on the right."""
+    even = shaken_texture()
+    times = even.sample_times()
+    frames = even.frames(times)
+    brighter = np.geomspace(0.1, 1.0, frames.shape[2], dtype=np.float32)
+    return VideoScene((frames * brighter).astype(np.float32), times)
+
+
+def found(scene, sensor, asked=None):
+    events = dase.simulate(scene, sensor, seed=3)
+    return find_larger_steps_in_the_dark(Measurement(events, scene), asked or Sensor(), seed=0)
+
+
+@pytest.mark.parametrize("more", [{}, {"jitter": {"spread": 0.1}}, {"mismatch": {"spread": 0.1}}])
+def test_a_current_is_told_whatever_thresholds_do(scene, more):
+    entry = found(scene, sensor_with(dark={"current": 0.05}, **more))
+    assert told_by(entry, EFFECTS) == ("dark",)
+    assert entry.details["current"] == entry.size == pytest.approx(0.05, rel=0.08)
+    assert entry.low <= 0.05 <= entry.high
+
+
+def test_a_knee_is_no_current(scene):
+    entry = found(scene, sensor_with(linlog={"knee": 0.2}))
+    assert told_by(entry, EFFECTS) == ("linlog",)
+    assert entry.details["knee"] == pytest.approx(0.2, rel=0.1)
+
+
+@pytest.mark.parametrize(
+    "more",
+    [
+        {},
+        {"bandwidth": {"cutoff": 30.0}},
+        {"refractory": {"period": 0.01}},
+        {"leak": {"rate": 2.0}},
+        {"shot": {"rate": 5.0}},
+        {"voltage_noise": {"sigma": 0.05}},
+        {"high_pass": {"cutoff": 5.0}},
+    ],
+)
+def test_what_else_makes_steps_differ_is_neither(scene, more):
+    assert found(scene, sensor_with(**more)) is None
+
+
+def test_a_model_that_has_the_current_by_its_light_shows_it_too(scene):
+    """What a model without dark current and knee shows by itself is not told of the measurement."""
+    assert found(scene, Sensor(log_eps=0.05), Sensor(log_eps=0.05)) is None
+    # what is asked for is left out of the model before
+    assert found(scene, sensor_with(dark={"current": 0.05}), sensor_with(dark={"current": 0.05})) is not None
+
+
+def test_too_few_steps_tell_nothing(scene):
+    events = dase.simulate(scene, sensor_with(dark={"current": 0.05}), seed=3)
+    many = replace(DARK_STEPS, steps=len(events))
+    measurement = Measurement(events, scene)
+    assert find_larger_steps_in_the_dark(measurement, Sensor(), seed=0, settings=many) is None
+
+
+def test_it_is_certain_however_badly_a_model_fits():
+    assert KINDS[LARGER_STEPS_IN_THE_DARK].whatever_fits
+    assert KINDS[LARGER_STEPS_IN_THE_DARK].beside_model
+
+
+def test_what_was_seen_has_its_size_where_no_fit_gave_one(scene):
+    diagnosis = dase.diagnose(
+        dase.simulate(scene, sensor_with(dark={"current": 0.05}), seed=3), scene=scene, most=1, pixels=300
+    )
+    assert [(one.effect, one.grade.value) for one in diagnosis.findings] == [("dark", "certain")]
+    assert diagnosis.findings[0].parameters["dark.current"].value == pytest.approx(0.05, rel=0.1)
+    entry = found(scene, sensor_with(dark={"current": 0.05}))
+    bare = replace(
+        diagnosis, parameters={}, findings=tuple(replace(f, parameters={}) for f in diagnosis.findings)
+    )
+    said = with_size_that_was_seen(bare, entry, "dark.current")
+    assert said.findings[0].parameters["dark.current"].value == entry.size
+    assert with_size_that_was_seen(diagnosis, entry, "dark.current") is diagnosis
