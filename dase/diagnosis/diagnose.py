@@ -28,7 +28,12 @@ from dase.diagnosis.held_frames import (
     with_longer_dead_time,
 )
 from dase.diagnosis.mostly_bursts import bursts_of_all_events, with_bursts_of_all_events
-from dase.diagnosis.seen_beside_model import look_beside_model, settle_dead_time, settle_jitter
+from dase.diagnosis.seen_beside_model import (
+    look_beside_model,
+    settle_dead_time,
+    settle_jitter,
+    settle_leak,
+)
 from dase.diagnosis.seen_effects import (
     SeenEffects,
     part_to_simulate,
@@ -163,6 +168,7 @@ def diagnose(
         return replace(again(state.other_scene), seconds=time.perf_counter() - begin)
     seen, model = settle_dead_time(state.task, state.events_alone, seen, measurement, model, judgement)
     seen = settle_jitter(state.task, state.events_alone, seen, measurement, model, judgement)
+    seen = settle_leak(state.task, seen, measurement, model)
     found = conclude_diagnosis(state, start, model, before, seen, names, measurement)
     found = _with_what_pixels_show(found, state.task, compared, seen, model, strength)
     if measurement.lens is not None:

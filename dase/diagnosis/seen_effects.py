@@ -18,6 +18,7 @@ from dase.diagnosis.led_pixels import follow_the_light
 from dase.diagnosis.tone_of_light import is_tone_of_light
 from dase.effects import EFFECTS, Effect
 from dase.effects.high_pass import HighPass
+from dase.effects.latency import Latency
 from dase.effects.made_signatures import makers_of, told_by
 from dase.effects.readout import BUSY, Readout
 from dase.effects.threshold import Threshold
@@ -59,6 +60,9 @@ search. What that lacks may have made them too high to see a lamp in the clip: a
 WEAK_TONE = 0.1
 """Swing of the rate below which a tone may be what bursts leave beside them; lamps swung it by 0.19 and more
 in 18 of 20 clips of other simulators in which one was seen."""
+
+TICKS_LATE = 1.5
+"""Ticks of the clock up to which events that are late may wait for one."""
 
 FRAMES_STAMPED = 0.5
 """Share of the frames of a clip at whose times packets are, from which on these are the frames."""
@@ -175,7 +179,7 @@ class SeenEffects:
             if one.effect in self._noise and one.grade is Grade.STAND_IN:
                 # noise that comes so is there, but the model with it is another's
                 one = replace(one, grade=Grade.EITHER, unknown=True, seen=seen[one.effect])
-            elif one.effect in self._contradicted and one.grade is Grade.SUPPORTED:
+            elif one.grade is Grade.SUPPORTED and self._is_in_doubt(one):
                 one = replace(one, grade=Grade.EITHER, unknown=True)
             elif one.effect in two_poles:
                 one = replace(
@@ -213,6 +217,20 @@ class SeenEffects:
                 out = [one for one in out if one.effect != name]
                 out.append(Finding(name, grade, others, seen=entry.sentence))
         return out
+
+    def _is_in_doubt(self, one: Finding) -> bool:
+        """Whether events one by one tell of another effect, or that something else makes them late."""
+        return one.effect in self._contradicted or self._waits_for_ticks(one)
+
+    def _waits_for_ticks(self, one: Finding) -> bool:
+        """Whether a latency is no longer than what an event may wait for a tick or a packet of the clock.
+
+        A clock that rounds up is late by a tick beside one that rounds down.
+        """
+        entry = self.entry_of(TIME_STAMPS)
+        delay = one.parameters.get(f"{Latency.name}.delay")
+        tick = entry.details.get("step", 0.0) if entry is not None else 0.0
+        return delay is not None and delay.value <= TICKS_LATE * tick
 
     def _two_poles_for_pole_and_delay(self, graded: Collection[Finding]) -> dict[str, tuple[str, ...]]:
         """Return the effects that make a pole and a delay, each to that of two poles that a fit has beside.

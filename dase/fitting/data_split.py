@@ -24,7 +24,7 @@ from dase.fitting.measurement import Measurement
 from dase.fitting.pixels_of_parts import PARTS, PixelsOfParts, choose_pixels
 from dase.fitting.subset import Array, CalibratedSubset, PixelSubset
 from dase.fitting.time_window import outside_gaps
-from dase.formatting import format_seconds
+from dase.formatting import format_count, format_seconds
 from dase.kernels import event_probes as kernels
 from dase.kernels import launch
 from dase.probes.accumulators import ProbeSums, StatisticsFrame
@@ -233,7 +233,7 @@ def split_measurement(
             `choose_windows`.
         left_out: What is not compared.
         models: What is known of the models beforehand.
-        pixels: In each part.
+        pixels: In each part; more where so many have too few events and more of them help.
         seed: Of the choice of pixels.
         device: Where kernels run.
         settings: How it is split.
@@ -243,6 +243,42 @@ def split_measurement(
     """
     # offsets are added for further random numbers, and batches count in 30 bits
     checked_seed(seed, 1 << 30)
+    split = partial(
+        _split_of_pixels, measurement, left_out, models, seed=seed, device=device, settings=settings
+    )
+    # who has a recording should not have to find out how many pixels it takes
+    try:
+        return split(pixels)
+    except _TooFewPixelsError as error:
+        out = split(error.wanted)
+        note = f"{format_count(error.wanted)} pixels are compared: {format_count(pixels)} had too few events"
+        return replace(out, notes=(*out.notes, note))
+
+
+class _TooFewPixelsError(InputError):
+    """Pixels that are compared have too few events, and more pixels help.
+
+    Args:
+        message: What is wrong.
+        wanted: Pixels that help.
+    """
+
+    def __init__(self, message: str, wanted: int):
+        super().__init__(message)
+        self.wanted = wanted
+
+
+def _split_of_pixels(
+    measurement: Measurement,
+    left_out: LeftOut,
+    models: ModelPremises,
+    pixels: int,
+    *,
+    seed: int,
+    device: str,
+    settings: SplitSettings,
+) -> SplitMeasurement:
+    """Return the parts of a measurement with so many pixels in each, see `split_measurement`."""
     plan = _plan_split(measurement, left_out, models, pixels=pixels, seed=seed, settings=settings)
     time, to = plan.time, _found_device(device)
     light = _light_of_pixels(plan)
@@ -554,25 +590,47 @@ def _require_enough_events(
     counts = [int(half.found.halves.sum()) for half in halves]
     for half, count, name in zip(halves, counts, ("fitting", "judging", "reporting"), strict=True):
         if count < least:
-            helps = _what_helps(half, count, max(counts), events, grid, least)
-            raise InputError(
+            wanted = _pixels_that_help(half, count, events, grid, least)
+            helps = (
+                f"looking at more pixels helps, {wanted} (pixels)"
+                if wanted else _what_helps(half, count, max(counts), events, grid, least)
+            )  # fmt: skip
+            said = (
                 f"too few events to say anything: {count} of the {len(events)} lie in the part for {name}, "
                 f"at least {least} are needed; {helps}" + "".join(f"; {note}" for note in notes)
             )
+            # the first part that lacks events tells: those after it are no larger
+            raise _TooFewPixelsError(said, wanted) if wanted else InputError(said)
+
+
+def _pixels_that_help(half: PixelSubset, count: int, events: Events, grid: Grid, least: int) -> int:
+    """Return how many pixels would have enough events; 0 where more of them do not help."""
+    stimulus = half.trials.stimulus
+    inside, size, looked = (
+        _events_inside(half, events, grid),
+        stimulus.width * stimulus.height,
+        len(stimulus.pixels),
+    )
+    if stimulus.holes and inside * looked >= 2 * least * size:
+        return 0  # it is not for want of pixels
+    # twice as many as are missing on the average: pixels differ
+    wanted = int(np.ceil(2 * least / max(count, 1) * looked / 100) * 100)
+    return wanted if count and wanted <= size // PARTS and inside >= 2 * least else 0
+
+
+def _events_inside(half: PixelSubset, events: Events, grid: Grid) -> int:
+    """Return how many events of all pixels come in the time of a part."""
+    begin, end = (grid.begin + grid.step * n for n in (half.frame.first, half.trials.stimulus.grid.steps))
+    return int(np.count_nonzero((events.t >= begin) & (events.t < end)))
 
 
 def _what_helps(half: PixelSubset, count: int, other: int, events: Events, grid: Grid, least: int) -> str:
     """Return what would give a part of a measurement enough events."""
     stimulus, first = half.trials.stimulus, half.frame.first
     begin, end = (grid.begin + grid.step * n for n in (first, stimulus.grid.steps))
-    inside = int(np.count_nonzero((events.t >= begin) & (events.t < end)))
-    size, looked = stimulus.width * stimulus.height, len(stimulus.pixels)
-    # twice as many as are missing on the average: pixels differ
-    wanted = int(np.ceil(2 * least / max(count, 1) * looked / 100) * 100)
-    if stimulus.holes and inside * looked >= 2 * least * size:
+    inside, looked = _events_inside(half, events, grid), len(stimulus.pixels)
+    if stimulus.holes and inside * looked >= 2 * least * stimulus.width * stimulus.height:
         return "most lie where the scene is not known: frames more often or less motion help"
-    if count and wanted <= size // PARTS and inside >= 2 * least:
-        return f"looking at more pixels helps, {wanted} instead of {looked} (pixels)"
     span = f"{begin:.3g} s to {end:.3g} s"
     if inside < len(events) // 20 and other >= least:
         return f"nearly all others come before or after {span}: record what goes on over the whole time"

@@ -243,6 +243,21 @@ def late(kind: str) -> Signature:
     return Signature(name="late events", answer=Answer.FOUND, sentence=f"a {kind}", details={kind: 1.0})
 
 
+@pytest.mark.parametrize(
+    ("delay", "details", "grade"),
+    [
+        (3.0e-3, {"step": 3e-3}, Grade.EITHER),
+        (9e-3, {"step": 3e-3}, Grade.SUPPORTED),
+        (3e-3, {}, Grade.SUPPORTED),
+    ],
+)
+def test_a_latency_no_longer_than_a_tick_may_wait_for_it(delay, details, grade):
+    stamps = Signature(name="time stamps", answer=Answer.FOUND, sentence="ticks", details=details)
+    found = Finding("latency", Grade.SUPPORTED, parameters={"latency.delay": Estimate(delay, delay, delay)})
+    said = next(one for one in SeenEffects((stamps,)).findings([found], ()) if one.effect == "latency")
+    assert said.grade is grade
+
+
 def test_a_pole_and_a_delay_may_be_two_poles_that_a_fit_has_beside():
     """A bandwidth and a latency were certain, and wrong, for poles of 9 and 20 Hz."""
     seen = SeenEffects((late("pole"), late("delay")))
