@@ -599,7 +599,7 @@ def _require_enough_events(
                 f"too few events to say anything: {count} of the {len(events)} lie in the part for {name}, "
                 f"at least {least} are needed; {helps}" + "".join(f"; {note}" for note in notes)
             )
-            # the first part that lacks events tells: those after it are no larger
+            # pixels of all parts are drawn alike, so what one of them needs will do for the others
             raise _TooFewPixelsError(said, wanted) if wanted else InputError(said)
 
 
