@@ -54,6 +54,15 @@ def mark_crowded(
         last[pixel[i]] = time[i]
 
 
+@wp.func
+def bin_of(interval: wp.float64, edges: wp.array[wp.float64]):
+    """Number of the bin of an interval, which is shorter than the last edge; 0 is below the first."""
+    kind = int(0)
+    while interval >= edges[kind]:
+        kind += 1
+    return kind
+
+
 @wp.kernel
 def count_short_intervals(
     # in
@@ -69,14 +78,15 @@ def count_short_intervals(
     last_polarity: wp.array[wp.uint8],  # (H * W,)
     count_out: wp.array4d[int],  # (3, K, 2, H * W): all intervals, those after a silence, and calm ones
     sum_out: wp.array[wp.float64],  # (K,) [s], of all intervals
-    late_out: wp.array3d[int],  # (3, L, 2): as `count_out`, of all pixels together
+    late_out: wp.array3d[int],  # (4, L, 2): as `count_out`, of all pixels together, and what follows them
     late_sum_out: wp.array[wp.float64],  # (L,) [s], of all intervals
     late_of_pixels_out: wp.array[int],  # (H * W,): after a silence, from the second to the last but one edge
 ):
     """Count how often a pixel is soon seen again with the same polarity. Called with dim=1.
 
     OFF and ON. After a silence is what follows an event before which the pixel was silent for as long as the
-    last edge; calm is such an interval that ends at a time of its own.
+    last edge; calm is such an interval that ends at a time of its own. What follows an interval is another up
+    to the last edge, of whatever length.
     """
     far = edges[edges.shape[0] - 1]
     beyond = late_edges.shape[0] - 1
@@ -86,9 +96,7 @@ def count_short_intervals(
         sign = polarity[i]
         interval = time[i] - last[place]
         if sign == last_polarity[place] and interval < far:
-            kind = int(0)
-            while interval >= edges[kind]:
-                kind += 1
+            kind = bin_of(interval, edges)
             count_out[0, kind, int(sign), place] += 1
             sum_out[kind] += interval
             if last_interval[place] >= far:
@@ -96,9 +104,7 @@ def count_short_intervals(
                 if shared[i] == wp.uint8(0):
                     count_out[2, kind, int(sign), place] += 1
         if sign == last_polarity[place] and interval < late_far:
-            late = int(0)
-            while interval >= late_edges[late]:
-                late += 1
+            late = bin_of(interval, late_edges)
             late_out[0, late, int(sign)] += 1
             late_sum_out[late] += interval
             if last_interval[place] >= late_far:
@@ -107,6 +113,8 @@ def count_short_intervals(
                     late_of_pixels_out[place] += 1
                 if shared[i] == wp.uint8(0):
                     late_out[2, late, int(sign)] += 1
+            else:
+                late_out[3, bin_of(last_interval[place], late_edges), int(sign)] += 1
         last_interval[place] = interval
         last[place] = time[i]
         last_polarity[place] = sign

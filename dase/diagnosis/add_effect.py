@@ -53,7 +53,7 @@ def fit_added(
             that does not change. None for the frames of the recording; events alone need one.
         trust: Where and when the scene is to be trusted; None for everywhere, and for what a
             `CameraScene` trusts of itself.
-        pixels: In each part of the measurement.
+        pixels: In each part of the measurement; up to ten times as many where these have too few events.
         seed: Of every random number.
         device: Where kernels run.
         progress: Told how far it is.

@@ -44,7 +44,7 @@ from dase.diagnosis.seen_effects import (
 from dase.diagnosis.settings import DEFAULTS, DiagnosisSettings
 from dase.diagnosis.silent_pixels import with_dead_pixels, without_the_explained_silence
 from dase.diagnosis.state import DiagnosisState, DiagnosisTask
-from dase.diagnosis.steps_in_the_dark import OF_WAYS
+from dase.diagnosis.steps_in_the_dark import EFFECT_OF_WAY
 from dase.diagnosis.unequal_thresholds import EFFECT as MISMATCH
 from dase.effects import EFFECTS, Effect
 from dase.effects.jitter import Jitter
@@ -106,7 +106,7 @@ def diagnose(
         trust: Where and when the scene is to be trusted; None for everywhere, and for what a
             `CameraScene` trusts of itself.
         most: Effects that are added at most.
-        pixels: In each part of the measurement.
+        pixels: In each part of the measurement; up to ten times as many where these have too few events.
         seed: Of every random number.
         device: Where kernels run.
         progress: Told how far it is.
@@ -302,7 +302,7 @@ def _with_what_pixels_show(
     if unequal is not None and MISMATCH in task.effects:
         found = with_size_that_was_seen(found, unequal, f"{MISMATCH}.spread")
     darker = seen.entry_of(LARGER_STEPS_IN_THE_DARK)
-    for way, (effect, parameter) in OF_WAYS.items():
+    for way, (effect, parameter) in EFFECT_OF_WAY.items():
         if darker is not None and way in darker.details and effect in task.effects:
             found = with_size_that_was_seen(found, darker, f"{effect}.{parameter}")
     silent = compared.silent

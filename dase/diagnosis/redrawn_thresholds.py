@@ -372,11 +372,13 @@ def add_jitter(
         model: Without a jitter.
         judgement: Its held-out error.
         found: By how much thresholds differ from event to event.
-        settings: By how much the error may rise.
+        settings: By how much the error may rise, and what was seen may be off from the fit.
     """
     sensor = with_fixed_effect(model, Jitter(spread=min(found.size, 1.0))).sensor
     fitted = refit_model(task.evidence, with_same_freedom(sensor, model, (EFFECT,)), seed=task.seed, rounds=1)
+    if is_unlike_fit(found, fitted.sensor, settings):
+        return None
     judged = task.judge(fitted)
-    if judged.error > judgement.error + settings.worse or is_unlike_fit(found, fitted.sensor, settings):
+    if judged.error > judgement.error + settings.worse:
         return None
     return Candidate(EFFECT, fitted, fitted.loss, judgement=judged)

@@ -21,7 +21,7 @@ from dase.diagnosis.redrawn_thresholds import EFFECT as JITTER
 from dase.diagnosis.redrawn_thresholds import find_jitter_beside, is_unlike_fit
 from dase.diagnosis.seen_effects import SeenEffects
 from dase.diagnosis.state import DiagnosisState, DiagnosisTask, EventsAlone, with_same_freedom
-from dase.diagnosis.steps_in_the_dark import MAKERS as DARKER
+from dase.diagnosis.steps_in_the_dark import MAKERS as MAKERS_OF_DARK_STEPS
 from dase.diagnosis.steps_in_the_dark import find_larger_steps_in_the_dark
 from dase.diagnosis.unequal_thresholds import EFFECT as MISMATCH
 from dase.diagnosis.unequal_thresholds import find_unequal_thresholds
@@ -43,6 +43,8 @@ from dase.signatures.kinds import (
     NOISE_AT_REST,
     UNEQUAL_THRESHOLDS,
 )
+from dase.signatures.result import Signature
+from dase.simulation.sensor import Sensor
 
 LATE_IN_DEAD_TIME = 1.5
 """Times of a dead time and a frame up to which what events wait for may look like a pole: one of 6.2 ms of
@@ -146,6 +148,8 @@ def settle_jitter(
 ) -> SeenEffects:
     """Return what is seen, with thresholds that are drawn anew at each event if the last model needs that.
 
+    Not with far more than its jitter: what looks so is something else.
+
     Args:
         task: What the diagnosis is asked.
         events_alone: Which noise was seen.
@@ -176,18 +180,26 @@ def settle_leak(
         measurement: Its light and its events are looked at.
         model: The last one.
     """
-    names = {one.name for one in seen.entries} & {LEAK_EVENTS, DRIFTING_MEMORY}
-    if not names or HighPass.name not in task.added_to(model):
+    if HighPass.name not in task.added_to(model):
         return seen
-    bare = model
-    if LEAKING in model.sensor:
-        bare = with_same_freedom(model.sensor.without(LEAKING), model, ())
-    others = replace(seen, entries=tuple(one for one in seen.entries if one.name not in names))
-    again = _look_at_thresholds(
-        task, _look_where_light_rests(task, others, measurement, bare), measurement, bare
-    )
-    left = {one.name for one in again.entries} & names
-    return replace(seen, entries=tuple(one for one in seen.entries if one.name not in names - left))
+    sensor = model.sensor.without(LEAKING) if LEAKING in model.sensor else model.sensor
+    gone = set()
+    if seen.entry_of(LEAK_EVENTS) is not None:
+        found = _events_at_rest(task, measurement, sensor)
+        gone |= {LEAK_EVENTS} - {found.name if found is not None else ""}
+    if seen.entry_of(DRIFTING_MEMORY) is not None:
+        light = LightBetweenEvents.of(measurement, log_eps=sensor.log_eps)
+        structure = task.evidence.structure
+        if light is None or not find_drifting_memory(light, sensor, structure=structure, seed=task.seed):
+            gone.add(DRIFTING_MEMORY)
+    return replace(seen, entries=tuple(one for one in seen.entries if one.name not in gone))
+
+
+def _events_at_rest(task: DiagnosisTask, measurement: Measurement, sensor: Sensor) -> Signature | None:
+    """Return the noise or the leak of pixels at rest that a sensor has not; None where it lacks neither."""
+    threshold = sensor["threshold"]
+    assert isinstance(threshold, Threshold)
+    return find_events_at_rest(measurement, sensor, thresholds=(threshold.on, threshold.off), seed=task.seed)
 
 
 def _look_where_light_rests(
@@ -196,11 +208,7 @@ def _look_where_light_rests(
     """Return what is seen, with the noise or the leak of pixels at rest that a model has not."""
     if task.evidence.contradiction or seen.lamp or seen.bursts is not None:
         return seen
-    threshold = model.sensor["threshold"]
-    assert isinstance(threshold, Threshold)
-    found = find_events_at_rest(
-        measurement, model.sensor, thresholds=(threshold.on, threshold.off), seed=task.seed
-    )
+    found = _events_at_rest(task, measurement, model.sensor)
     return seen if found is None else replace(seen, entries=(*seen.entries, found))
 
 
@@ -247,7 +255,7 @@ def _look_at_steps_in_the_dark(
     task: DiagnosisTask, seen: SeenEffects, measurement: Measurement, model: FittedModel
 ) -> SeenEffects:
     """Return what is seen, with by how much farther light goes between two events in the dark, if it does."""
-    if task.evidence.contradiction or seen.lamp or task.given.intersection(DARKER):
+    if task.evidence.contradiction or seen.lamp or task.given.intersection(MAKERS_OF_DARK_STEPS):
         return seen
     found = find_larger_steps_in_the_dark(measurement, model.sensor, seed=task.seed)
     return seen if found is None else replace(seen, entries=(*seen.entries, found))

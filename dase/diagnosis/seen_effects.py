@@ -172,6 +172,9 @@ class SeenEffects:
             graded: What the search says of each effect of the last model.
             given: Effects that the sensor had before.
         """
+        if any(self._is_late_by_a_tick(one) for one in self.entries):
+            kept = tuple(one for one in self.entries if not self._is_late_by_a_tick(one))
+            return replace(self, entries=kept).findings(graded, given)
         seen = self.effects
         out = []
         two_poles = self._two_poles_for_pole_and_delay(graded)
@@ -223,14 +226,23 @@ class SeenEffects:
         return one.effect in self._contradicted or self._waits_for_ticks(one)
 
     def _waits_for_ticks(self, one: Finding) -> bool:
-        """Whether a latency is no longer than what an event may wait for a tick or a packet of the clock.
+        """Whether a latency is no longer than what an event may wait for a tick or a packet of the clock."""
+        delay = one.parameters.get(f"{Latency.name}.delay")
+        return delay is not None and delay.value <= self._longest_wait
+
+    def _is_late_by_a_tick(self, entry: Signature) -> bool:
+        """Whether events are late by no more than that."""
+        return entry.name == LATE_EVENTS and 0 < entry.details.get("delay", 0.0) <= self._longest_wait
+
+    @property
+    def _longest_wait(self) -> float:
+        """Time that events may wait for the clock [s], below 0 where stamps follow none.
 
         A clock that rounds up is late by a tick beside one that rounds down.
         """
         entry = self.entry_of(TIME_STAMPS)
-        delay = one.parameters.get(f"{Latency.name}.delay")
         tick = entry.details.get("step", 0.0) if entry is not None else 0.0
-        return delay is not None and delay.value <= TICKS_LATE * tick
+        return TICKS_LATE * float(tick) if tick else -1.0
 
     def _two_poles_for_pole_and_delay(self, graded: Collection[Finding]) -> dict[str, tuple[str, ...]]:
         """Return the effects that make a pole and a delay, each to that of two poles that a fit has beside.
@@ -459,9 +471,11 @@ def without_the_scene(seen: SeenEffects, measurement: Measurement, sensor: Senso
         if is_held(scene) or doubles.answer is Answer.NOT_SEEN:
             seen = _with_doubles(seen, doubles)
     if isinstance(scene, VideoScene):
-        tones = [one for one in seen.entries if one.name == FLICKER]
-        if any(is_tone_of_light(one, scene, log_eps=sensor.log_eps) for one in tones):
-            seen = replace(seen, entries=tuple(one for one in seen.entries if one not in tones))
+        of_light = [
+            one for one in seen.entries
+            if one.name == FLICKER and is_tone_of_light(one, measurement, log_eps=sensor.log_eps)
+        ]  # fmt: skip
+        seen = replace(seen, entries=tuple(one for one in seen.entries if one not in of_light))
     asked = _asked_of_scene(seen.entries, scene)
     if not asked:
         return seen

@@ -35,10 +35,10 @@ from dase.simulation.sensor import Sensor
 
 Array = NDArray[np.float64]
 
-OF_WAYS = {"current": (Dark.name, "current"), "knee": (Linlog.name, "knee")}
-"""Way to the effect and its parameter."""
+EFFECT_OF_WAY = {"current": (Dark.name, "current"), "knee": (Linlog.name, "knee")}
+"""Detail of the signature to the effect that it tells of, and its parameter."""
 
-MAKERS = tuple(effect for effect, _ in OF_WAYS.values())
+MAKERS = tuple(effect for effect, _ in EFFECT_OF_WAY.values())
 
 LOOKED_AT = StepSettings(darkest=0.015, samples=8_000_000, events=300_000)
 """Pixels, instants and events; light far below that of steps that count, or these would be the short ones."""
@@ -82,13 +82,26 @@ class DarkStepSettings:
     """Time of one that counts, at most [s]: noise and leaks grow with time."""
 
     model: float = 0.5
-    """What a model without either may show, relative to what is seen."""
+    """What steps of a model without either may differ by, relative to what is seen."""
 
     groups: int = 8
-    """Of pixels, whose currents tell how well it is known."""
+    """Of blocks of pixels, which tell how well a size is known; half of them must have enough steps."""
+
+    of_group: int = 200
+    """Steps of either polarity that a group has, at least."""
+
+    block: int = 8
+    """[px] Neighbours see the same edges: blocks are independent, pixels are not."""
+
+    ends: float = 0.02
+    """Share by which a size must be away from the ends of what is looked for."""
 
     known: float = 0.08
     """Error of a size beside chance, relative: light between frames is a guess. Six were 1 to 6 % off."""
+
+    def range_of(self, name: str) -> tuple[float, float]:
+        """Return the least and the largest size of a law that is looked for."""
+        return self.current if name == "current" else self.knee
 
 
 DARK_STEPS = DarkStepSettings()
@@ -96,22 +109,36 @@ DARK_STEPS = DarkStepSettings()
 
 @dataclass(frozen=True, eq=False)
 class _Steps:
-    """Steps of one polarity: log intensity less that of the brightest light, before and after, shape (N,)."""
+    """Steps of one polarity.
+
+    Args:
+        before: Log intensity less that of the brightest light, at the earlier event, shape (N,).
+        after: The same at the later one.
+        sign: 1 of ON events, -1 of OFF events.
+        block: Of the pixel, shape (N,).
+    """
 
     before: Array
     after: Array
     sign: int
-    pixel: NDArray[np.int64]
+    block: NDArray[np.int64]
 
     def part(self, group: int, groups: int) -> _Steps:
-        """Return those of every so many pixels."""
-        mine = self.pixel % groups == group
-        return _Steps(self.before[mine], self.after[mine], self.sign, self.pixel[mine])
+        """Return those of every so many blocks."""
+        mine = self.block % groups == group
+        return _Steps(self.before[mine], self.after[mine], self.sign, self.block[mine])
 
     def differ(self, response: Callable[[Array], Array], bins: int) -> float:
-        """Return what the medians of steps of a response differ by at different levels, relative."""
+        """Return what the medians of steps of a response differ by at different levels, relative.
+
+        Infinite where a level has no steps: the light of many is the same.
+        """
         level = self.before + self.after
+        if len(level) < bins:
+            return math.inf
         at = np.searchsorted(np.quantile(level, np.arange(1, bins) / bins), level)
+        if np.bincount(at, minlength=bins).min() == 0:
+            return math.inf
         moved = self.sign * (response(self.after) - response(self.before))
         medians = np.array([np.median(moved[at == n]) for n in range(bins)])
         mean = float(medians.mean())
@@ -160,9 +187,11 @@ def find_larger_steps_in_the_dark(
     if light is None:
         return None
     brightest = float(np.quantile(light.level[:: max(1, len(light.level) // 50)], 0.99))
-    seen = _steps_of(light.seen, brightest, settings)
+    width = measurement.scene.width
+    seen = _steps_of(light.seen, brightest, width, settings)
     law, differ = _law_of(seen, settings), _differ(seen, None, settings)
-    if law is None:
+    chance = None if law is None else _error_of(seen, law, settings)
+    if law is None or chance is None:
         return None
     for name in MAKERS:
         sensor = sensor.without(name) if name in sensor else sensor
@@ -170,12 +199,14 @@ def find_larger_steps_in_the_dark(
         made = light.of_model(sensor, seed=SimulationStream.STEPS_IN_THE_DARK.seed(seed))
     except InputError:
         return None
-    modelled = _law_of(_steps_of(made, brightest, settings), settings)
-    if modelled is not None and modelled.size > settings.model * law.size:
+    modelled = _steps_of(made, brightest, width, settings)
+    # steps of a model that sends too few, or that differ as much by whatever law, tell nothing
+    if not modelled or _differ(modelled, None, settings) > settings.model * differ:
         return None
     unit = math.exp(brightest)
-    size = unit * law.size
-    error = math.hypot(NINETY * unit * _error_of(seen, law, settings), settings.known * size)
+    # light is known with `log_eps` added to it: a current comes on top of that, a knee lies above it
+    size = unit * law.size - (sensor.log_eps if law.name == "knee" else 0.0)
+    error = math.hypot(NINETY * unit * chance, settings.known * size)
     what = "a current without light" if law.name == "current" else "a response that is linear below a knee"
     then, at_once = format_percent(law.left), format_percent(differ)
     sentence = (
@@ -184,13 +215,15 @@ def find_larger_steps_in_the_dark(
     )
     return Signature(
         name=LARGER_STEPS_IN_THE_DARK, answer=Answer.FOUND, p=0.0, size=size, low=max(size - error, 0.0),
-        high=size + error, unit="intensity", least=settings.current[0] * unit, sentence=sentence,
+        high=size + error, unit="intensity", least=settings.range_of(law.name)[0] * unit, sentence=sentence,
         details={law.name: size},
     )  # fmt: skip
 
 
-def _steps_of(steps: LightSteps, brightest: float, settings: DarkStepSettings) -> list[_Steps]:
+def _steps_of(steps: LightSteps, brightest: float, width: int, settings: DarkStepSettings) -> list[_Steps]:
     """Return the steps that count, of ON and OFF events that follow one of the same polarity; none if few."""
+    rows, columns = np.divmod(steps.pixel, width)
+    block = rows // settings.block * (width // settings.block + 1) + columns // settings.block
     out = []
     for sign in (1, -1):
         counts = steps.counts & steps.again & (steps.gap < settings.longest) & (steps.on == (sign > 0))
@@ -198,7 +231,7 @@ def _steps_of(steps: LightSteps, brightest: float, settings: DarkStepSettings) -
         after = steps.level[counts] - brightest
         if len(after) < settings.steps:
             return []
-        out.append(_Steps(after - steps.change[counts], after, sign, steps.pixel[counts]))
+        out.append(_Steps(after - steps.change[counts], after, sign, block[counts]))
     return out
 
 
@@ -217,12 +250,13 @@ def _law_of(steps: list[_Steps], settings: DarkStepSettings) -> _Law | None:
     best, other = sorted((_fit(steps, name, settings) for name in LAWS), key=lambda one: one.left)
     if best.left > settings.left * differ or other.left < settings.decided * best.left:
         return None
-    return best
+    low, high = settings.range_of(best.name)
+    return best if low * (1 + settings.ends) < best.size < high * (1 - settings.ends) else None
 
 
 def _fit(steps: list[_Steps], name: str, settings: DarkStepSettings) -> _Law:
     """Return the size of a current or a knee with which steps differ least."""
-    low, high = settings.current if name == "current" else settings.knee
+    low, high = settings.range_of(name)
 
     def left(log: float) -> float:
         return _differ(steps, LAWS[name](math.exp(log)), settings)
@@ -231,11 +265,19 @@ def _fit(steps: list[_Steps], name: str, settings: DarkStepSettings) -> _Law:
     begin = int(np.argmin([left(one) for one in tried]))
     ends = tried[max(begin - 1, 0)], tried[min(begin + 1, len(tried) - 1)]
     found = minimize_scalar(left, bounds=ends, method="bounded", options={"xatol": 0.01})
-    return _Law(name, math.exp(float(found.x)), float(found.fun))
+    at, least = min((left(tried[begin]), float(tried[begin])), (float(found.fun), float(found.x)))[::-1]
+    return _Law(name, math.exp(at), least)
 
 
-def _error_of(steps: list[_Steps], law: _Law, settings: DarkStepSettings) -> float:
-    """Return the standard error of a size, by those of groups of pixels, relative to the brightest light."""
-    parts = [[one.part(n, settings.groups) for one in steps] for n in range(settings.groups)]
-    sizes = [_fit(part, law.name, settings).size for part in parts]
+def _error_of(steps: list[_Steps], law: _Law, settings: DarkStepSettings) -> float | None:
+    """Return the standard error of a size, by those of groups of blocks, relative to the brightest light.
+
+    None where too few groups have enough steps.
+    """
+    parts = ([one.part(n, settings.groups) for one in steps] for n in range(settings.groups))
+    parts = (part for part in parts if min(len(one.after) for one in part) >= settings.of_group)
+    found = [_fit(part, law.name, settings) for part in parts]
+    sizes = [one.size for one in found if math.isfinite(one.left)]
+    if 2 * len(sizes) < settings.groups:
+        return None
     return float(np.std(sizes, ddof=1)) / math.sqrt(len(sizes))

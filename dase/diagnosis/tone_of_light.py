@@ -10,49 +10,60 @@ from __future__ import annotations
 
 import numpy as np
 
+from dase.diagnosis.light_between_events import times_that_are_compared
+from dase.fitting.measurement import Measurement
 from dase.probes.stimulus import log_light_of
-from dase.scenes.video import VideoScene
 from dase.signatures.result import Signature
 
-PIXELS = 4000
-"""Pixels whose light is looked at: a tone of the whole array shows in few."""
+SAMPLES = 8_000_000
+"""Pixels times instants that are looked at, at most: a tone of the whole array shows in few pixels."""
 
 SHARE = 0.5
 """Swing of the light, relative to that of the events, from which on a tone is the scene's: 0.6 to 1.4 in four
 clips of two pans, 0.01 at most of the lamps of six clips (development)."""
 
 
-def is_tone_of_light(entry: Signature, scene: VideoScene, *, log_eps: float, share: float = SHARE) -> bool:
+def is_tone_of_light(
+    entry: Signature, measurement: Measurement, *, log_eps: float, share: float = SHARE
+) -> bool:
     """Return whether the light of a clip swings at a frequency about as much as its events do.
 
     Args:
         entry: Flicker that is seen in the events.
-        scene: What they are of.
+        measurement: Its scene is a clip.
         log_eps: Added to intensities before the logarithm.
         share: Of the swing of the events that the light has to have.
     """
-    return swing_of_light(scene, entry.details["frequency"], log_eps=log_eps) >= share * entry.size
+    known = entry.details
+    low, high = (known.get(f"frequency_{end}", known["frequency"]) for end in ("low", "high"))
+    return swing_of_light(measurement, low, high, log_eps=log_eps) >= share * entry.size
 
 
-def swing_of_light(scene: VideoScene, frequency: float, *, log_eps: float) -> float:
+def swing_of_light(measurement: Measurement, low: float, high: float, *, log_eps: float) -> float:
     """Return by how much a tone moves the change of the light of all pixels, relative to all that changes.
 
-    Of events the same is the swing of ON less OFF, relative to their rate.
+    Of events the same is the swing of ON less OFF, relative to their rate. Frames cannot tell a tone above
+    half of their rate from a slower one, so that there is none.
 
     Args:
-        scene: A clip.
-        frequency: Of the tone [Hz].
+        measurement: Its scene is a clip; of the time that is compared.
+        low: Least frequency of the tone [Hz].
+        high: Highest frequency [Hz].
         log_eps: Added to intensities before the logarithm.
     """
-    times, number = scene.sample_times(), scene.width * scene.height
-    pixels = np.arange(0, number, max(1, number // PIXELS), dtype=np.int32)
+    times, scene = times_that_are_compared(measurement), measurement.scene
+    if len(times) < 3 or high > 0.5 / float(np.median(np.diff(times))):
+        return 0.0
+    number = scene.width * scene.height
+    every = max(1, -(-number * len(times) // SAMPLES))
+    pixels = np.arange(0, number, every, dtype=np.int32)
     change = np.diff(log_light_of(scene, times, pixels, log_eps=log_eps), axis=0)
     net, whole = change.sum(1, dtype=np.float64), float(np.abs(change).sum(dtype=np.float64))
-    if whole <= 0 or len(net) < 2:
+    if whole <= 0:
         return 0.0
     net -= net.mean()
-    # the frequency is read off the events, and no better known than they are long
+    # two tones are told apart by one turn over all of the time
     resolved = 1 / float(times[-1] - times[0])
     middle = 0.5 * (times[1:] + times[:-1])
-    near = [np.exp(-2j * np.pi * (frequency + turn * resolved) * middle) for turn in (-0.5, 0.0, 0.5)]
-    return max(float(abs(net @ wave)) for wave in near) / whole
+    tried = np.arange(low - 0.5 * resolved, high + 0.6 * resolved, 0.5 * resolved)
+    return max(float(abs(net @ np.exp(-2j * np.pi * one * middle))) for one in tried) / whole

@@ -53,6 +53,10 @@ class SplitSettings:
     least_events: int = 300
     """Events that a part must have for anything to be said."""
 
+    more_pixels: float = 10.0
+    """Times as many pixels as were asked for that are compared where these have too few events, at most: the
+    light of more takes more memory than whoever asked expects."""
+
     large: float = 0.25
     """Share of the pixels' time at rest, or not at rest, that the later part of the time must have for the
     fitted part to lack it."""
@@ -250,8 +254,12 @@ def split_measurement(
     try:
         return split(pixels)
     except _TooFewPixelsError as error:
+        # fewer than were asked for were there, or so many take more memory than is expected
+        if not pixels < error.wanted <= settings.more_pixels * pixels:
+            raise
         out = split(error.wanted)
-        note = f"{format_count(error.wanted)} pixels are compared: {format_count(pixels)} had too few events"
+        looked = format_count(len(out.train.trials.stimulus.pixels))
+        note = f"{looked} pixels are compared: {format_count(pixels)} had too few events"
         return replace(out, notes=(*out.notes, note))
 
 
@@ -588,34 +596,42 @@ def _require_enough_events(
     halves: list[PixelSubset], events: Events, grid: Grid, notes: list[str], least: int
 ) -> None:
     counts = [int(half.found.halves.sum()) for half in halves]
-    for half, count, name in zip(halves, counts, ("fitting", "judging", "reporting"), strict=True):
-        if count < least:
-            wanted = _pixels_that_help(half, count, events, grid, least)
-            helps = (
-                f"looking at more pixels helps, {wanted} (pixels)"
-                if wanted else _what_helps(half, count, max(counts), events, grid, least)
-            )  # fmt: skip
-            said = (
-                f"too few events to say anything: {count} of the {len(events)} lie in the part for {name}, "
-                f"at least {least} are needed; {helps}" + "".join(f"; {note}" for note in notes)
-            )
-            # pixels of all parts are drawn alike, so what one of them needs will do for the others
-            raise _TooFewPixelsError(said, wanted) if wanted else InputError(said)
+    few = [n for n, count in enumerate(counts) if count < least]
+    if not few:
+        return
+    first, name = few[0], ("fitting", "judging", "reporting")[few[0]]
+    # parts are of other times, so each may need another number
+    each = [_pixels_that_help(halves[n], counts[n], events, grid, least) for n in few]
+    wanted = max(each) if all(each) else 0
+    if wanted:
+        looked = len(halves[first].trials.stimulus.pixels)
+        helps = f"looking at more pixels helps, {wanted} instead of {looked} (pixels)"
+    else:
+        helps = _what_helps(halves[first], counts[first], max(counts), events, grid, least)
+    said = (
+        f"too few events to say anything: {counts[first]} of the {len(events)} lie in the part for {name}, "
+        f"at least {least} are needed; {helps}" + "".join(f"; {note}" for note in notes)
+    )
+    raise _TooFewPixelsError(said, wanted) if wanted else InputError(said)
 
 
 def _pixels_that_help(half: PixelSubset, count: int, events: Events, grid: Grid, least: int) -> int:
     """Return how many pixels would have enough events; 0 where more of them do not help."""
-    stimulus = half.trials.stimulus
-    inside, size, looked = (
-        _events_inside(half, events, grid),
-        stimulus.width * stimulus.height,
-        len(stimulus.pixels),
-    )
-    if stimulus.holes and inside * looked >= 2 * least * size:
-        return 0  # it is not for want of pixels
+    size, looked = half.trials.stimulus.width * half.trials.stimulus.height, len(half.trials.stimulus.pixels)
+    if _lacks_the_scene(half, events, grid, least):
+        return 0
     # twice as many as are missing on the average: pixels differ
     wanted = int(np.ceil(2 * least / max(count, 1) * looked / 100) * 100)
-    return wanted if count and wanted <= size // PARTS and inside >= 2 * least else 0
+    return (
+        wanted if count and wanted <= size // PARTS and _events_inside(half, events, grid) >= 2 * least else 0
+    )
+
+
+def _lacks_the_scene(half: PixelSubset, events: Events, grid: Grid, least: int) -> bool:
+    """Return whether most events lie where the scene is not known."""
+    stimulus = half.trials.stimulus
+    looked, size = len(stimulus.pixels), stimulus.width * stimulus.height
+    return bool(stimulus.holes) and _events_inside(half, events, grid) * looked >= 2 * least * size
 
 
 def _events_inside(half: PixelSubset, events: Events, grid: Grid) -> int:
@@ -625,11 +641,11 @@ def _events_inside(half: PixelSubset, events: Events, grid: Grid) -> int:
 
 
 def _what_helps(half: PixelSubset, count: int, other: int, events: Events, grid: Grid, least: int) -> str:
-    """Return what would give a part of a measurement enough events."""
+    """Return what would give a part of a measurement enough events, beside more pixels."""
     stimulus, first = half.trials.stimulus, half.frame.first
     begin, end = (grid.begin + grid.step * n for n in (first, stimulus.grid.steps))
-    inside, looked = _events_inside(half, events, grid), len(stimulus.pixels)
-    if stimulus.holes and inside * looked >= 2 * least * stimulus.width * stimulus.height:
+    inside = _events_inside(half, events, grid)
+    if _lacks_the_scene(half, events, grid, least):
         return "most lie where the scene is not known: frames more often or less motion help"
     span = f"{begin:.3g} s to {end:.3g} s"
     if inside < len(events) // 20 and other >= least:

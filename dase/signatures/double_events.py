@@ -15,8 +15,8 @@ A slow handshake is answered twice only after some ten microseconds. What is as 
 fast rise as well. So it counts where hardly any is later, and hardly ever two in a row.
 
 Some simulations have doubles some hundred microseconds late, which is what edges do, too, but at all times
-from event to event. So these are doubles where hardly any event is sooner or later than they are, of either
-polarity, up to milliseconds, and where the pixel was silent as long before.
+from event to event. So these are doubles where the pixel was silent for more than a millisecond before, if
+hardly any pair of either polarity is sooner or later than they are, and hardly any has a third event.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ class DoubleSettings:
     """Share of slow doubles, at least, before whose first event the pixel was silent for `far`."""
 
     late: tuple[float, ...] = (160e-6, 320e-6, 640e-6)
-    """[s] Ends of what is looked at for late ones, which begins at a quarter of it."""
+    """[s] Ends of what is looked at for late ones, from a quarter of each; one is twice the one before."""
 
     late_far: float = 1.6e-3
     """[s] Up to which others are counted, and for which pixels were silent before late doubles."""
@@ -74,8 +74,8 @@ class DoubleSettings:
     """Intervals that are shorter than late doubles, relative to these, at most."""
 
     late_later: float = 0.2
-    """The same of longer ones, up to `late_far`. Two steps of a jump behind a fast low-pass are as alike, but
-    come after each frame: frames come sooner than the pixel would have to be silent before."""
+    """The same of longer ones, up to `late_far`, and of third events as soon after. Two steps of a jump behind
+    a fast low-pass are as alike, but come after each frame, sooner than the pixel would have to be silent."""
 
     late_usual: float = 0.5
     """Share of late doubles, at least, of other pixels than the busiest, those beyond `bulk`."""
@@ -110,8 +110,9 @@ class IntervalCounts:
             [s.tie, 0.25 * s.late[0], *(0.5 * end for end in s.late), s.late[-1], s.late_far]
         )
         """The same of late doubles, shape (L,)."""
-        self.late = np.zeros((3, len(self.late_edges), 2), np.int32)
-        """As `counts`, of all pixels together, and after a silence of `late_far`, shape (3, L, 2)."""
+        self.late = np.zeros((4, len(self.late_edges), 2), np.int32)
+        """As `counts`, of all pixels together, and after a silence of `late_far`, and how many others follow
+        within that time, shape (4, L, 2)."""
         self.late_sums = np.zeros(len(self.late_edges))
         """As `sums`, shape (L,)."""
         self.late_of_pixels = np.zeros(width * height, np.int32)
@@ -291,13 +292,14 @@ def _look_for_late(
 
     Args:
         intervals: Counted intervals.
-        hot: Pixels to leave out, shape (H * W,).
+        hot: Pixels that are not usual, shape (H * W,); what they send comes at all times.
         level: p below which they are there.
-        tick: Time between the ticks of the stamps, or from scan to scan [s]: intervals are multiples of it.
+        tick: Time between the ticks of the stamps, or from scan to scan [s]: it hides what is not far longer.
     """
-    s, events = intervals.settings, intervals.events.sum(1)
-    of_pixels = intervals.late_of_pixels
-    count = intervals.events.sum(0)
+    if np.all(hot):
+        return None
+    s, events = intervals.settings, intervals.events[:, ~hot].sum(1)
+    of_pixels, count = intervals.late_of_pixels, intervals.events.sum(0)
     usual = ~hot & (count <= np.quantile(count[~hot], s.bulk))
     if int(of_pixels[usual].sum()) < s.late_usual * int(of_pixels.sum()):
         return None
@@ -308,10 +310,11 @@ def _look_for_late(
             intervals.late[:, part].sum(1)
             for part in (slice(number - 1, number + 1), slice(number + 1, None), slice(1, number - 1))
         )
-        every, silent, calm = near  # OFF and ON
+        every, silent, calm, followed = near  # OFF and ON
         if (
             np.any(calm < np.maximum(s.least * events, 20))
             or np.any(later[2] > s.late_later * calm)
+            or np.any(followed > s.late_later * every)
             or np.any(sooner[2] > s.late_sooner * calm)
             or np.any(silent < s.alone * every)
         ):
@@ -323,7 +326,7 @@ def _look_for_late(
         low, high = (limit / total for limit in poisson_interval(number_of))
         gap = float(intervals.late_sums[number - 1 : number + 1].sum() / number_of)
         begins, ends, far = (format_seconds(time) for time in (0.25 * end, end, s.late_far))
-        others = f"{format_count(int(later[0].sum()))} from there to {far}"
+        others = f"{format_count(int(later[1].sum()))} from there to {far} after as long a silence"
         found = Signature(
             name=DOUBLE_EVENTS, answer=Answer.NOT_SEEN, p=p, size=number_of / total, low=low, high=high,
             unit="share of the events", least=s.least,

@@ -243,7 +243,7 @@ def find_signatures(
     # what a bus sends evenly comes at multiples of its time for one event
     stamps = find_time_stamps(first.first_events(), hot_pixels, each, repeats=lit or even_bus is not None)
     tick = max(stamps.details.get(name, 0.0) for name in ("step", "period")) if stamps.found else 0.0
-    if tick and not hot.found:
+    if tick and "packets" not in stamps.details and not hot.found:
         hot, hot_pixels = look_for_hot(tick=tick)
     entries = (
         coupling,

@@ -34,9 +34,10 @@ class SignatureKind:
         name: As in `dase.signatures.result.Signature`.
         about: What events do, in a line.
         ways: Details that only some of these signatures have, by which they tell effects apart: of time
-            stamps the time between ticks or that of a line [s], of noise the share of successive events that
-            are opposite, where these are independent or return, of late events by how much they are, or the
-            poles that light is behind, of larger steps in the dark the current or the knee that makes them.
+            stamps the time between ticks, in the median where these are packets, or that of a line [s], of
+            noise the share of successive events that are opposite, where these are independent or return, of
+            late events by how much they are, or the poles that light is behind, of larger steps in the dark
+            the current or the knee that makes them.
         beside_model: Whether it is what a model over the same scene lacks: events alone do not show it.
         whatever_fits: Whether it is there however badly that model fits.
         of_light: Whether light makes it by itself: a scene may show it to any sensor, and an effect that

@@ -3,7 +3,7 @@ packets that leave at times of their own.
 
 A packet has what the array has sent since the one before it, so the longer that is ago, the more events have
 its time. What works frame by frame also gives many events one time, but some gaps between such times come
-again and again, and no longer ones have more.
+again and again, or longer ones have no more.
 """
 
 from __future__ import annotations
@@ -125,6 +125,8 @@ def _find_packets(events: Events, s: StampSettings) -> Signature | None:
         return None
     if np.unique(gaps, return_counts=True)[1].max() > s.alike * len(gaps):
         return None
+    if np.ptp(many[1:]) == 0:
+        return None
     follows = float(stats.spearmanr(gaps, many[1:]).statistic)
     if follows < s.follows:
         return None
@@ -134,7 +136,7 @@ def _find_packets(events: Events, s: StampSettings) -> Signature | None:
         name=TIME_STAMPS, answer=Answer.NOT_SEEN, p=float(stats.norm.sf(follows * math.sqrt(len(gaps) - 1))),
         size=shared / len(events), low=float(low), high=float(high), unit="share of the events",
         sentence=f"events get their times in packets, {format_seconds(gap)} after each other in the median "
-        f"and never alike: {format_percent(shared / len(events))} of the events share theirs",
+        f"and hardly ever alike: {format_percent(shared / len(events))} of the events share theirs",
         details={"step": gap, "packets": float(len(stamps))},
     )  # fmt: skip
 

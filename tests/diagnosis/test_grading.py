@@ -256,6 +256,17 @@ def test_a_latency_no_longer_than_a_tick_may_wait_for_it(delay, details, grade):
     found = Finding("latency", Grade.SUPPORTED, parameters={"latency.delay": Estimate(delay, delay, delay)})
     said = next(one for one in SeenEffects((stamps,)).findings([found], ()) if one.effect == "latency")
     assert said.grade is grade
+    # light between events tells of the same
+    late = Signature(name="late events", answer=Answer.FOUND, sentence="late", details={"delay": delay})
+    seen = SeenEffects((stamps, late))
+    said = next(one for one in seen.findings([found], ()) if one.effect == "latency")
+    assert said.grade is (Grade.EITHER if grade is Grade.EITHER else Grade.CERTAIN)
+    assert said.parameters == found.parameters
+
+
+def test_a_latency_of_nothing_waits_for_no_clock():
+    found = Finding("latency", Grade.SUPPORTED, parameters={"latency.delay": Estimate(0.0, 0.0, 0.0)})
+    assert SeenEffects(()).findings([found], ()) == [found]
 
 
 def test_a_pole_and_a_delay_may_be_two_poles_that_a_fit_has_beside():

@@ -258,9 +258,14 @@ def test_too_few_events_says_what_helps():
             split_measurement(Measurement(of, scene), pixels=pixels)
         return str(caught.value)
 
-    more = split_measurement(Measurement(events(20_000), StaticScene(64, 64, 1.0)), pixels=32)
-    assert "pixels are compared: 32 had too few events" in more.notes[-1]
-    assert len(more.train.trials.stimulus.pixels) > 32
+    more = split_measurement(Measurement(events(20_000), StaticScene(64, 64, 1.0)), pixels=60)
+    assert "pixels are compared: 60 had too few events" in more.notes[-1]
+    assert len(more.train.trials.stimulus.pixels) > 60
+    # far more than were asked for
+    assert "looking at more pixels helps" in sentence(events(20_000), 32)
+    # still too few with as many as there are
+    with pytest.raises(dase.InputError, match="too few events"):
+        split_measurement(Measurement(events(1_500), StaticScene(64, 64, 1.0)), pixels=600)
     assert "times as long" in sentence(events(300), 2000)
     early = events(20_000, 0.0, 0.5)
     tail = events(20, 0.5, 1.0)

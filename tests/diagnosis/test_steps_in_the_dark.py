@@ -9,6 +9,7 @@ import pytest
 from helpers.frame_simulator import shaken_texture
 
 import dase
+from dase.diagnosis.light_between_events import LightBetweenEvents
 from dase.diagnosis.seen_effects import with_size_that_was_seen
 from dase.diagnosis.steps_in_the_dark import DARK_STEPS, find_larger_steps_in_the_dark
 from dase.effects import EFFECTS
@@ -50,10 +51,12 @@ def test_a_current_is_told_whatever_thresholds_do(scene, more):
     assert entry.low <= 0.05 <= entry.high
 
 
-def test_a_knee_is_no_current(scene):
-    entry = found(scene, sensor_with(linlog={"knee": 0.2}))
+@pytest.mark.parametrize("log_eps", [1e-3, 0.03])
+def test_a_knee_is_no_current(scene, log_eps):
+    bare = Sensor(log_eps=log_eps)
+    entry = found(scene, bare.with_effect(EFFECTS["linlog"](knee=0.2)), bare)
     assert told_by(entry, EFFECTS) == ("linlog",)
-    assert entry.details["knee"] == pytest.approx(0.2, rel=0.1)
+    assert entry.details["knee"] == entry.size == pytest.approx(0.2, rel=0.1)
 
 
 @pytest.mark.parametrize(
@@ -72,9 +75,17 @@ def test_what_else_makes_steps_differ_is_neither(scene, more):
     assert found(scene, sensor_with(**more)) is None
 
 
-def test_a_model_that_has_the_current_by_its_light_shows_it_too(scene):
-    """What a model without dark current and knee shows by itself is not told of the measurement."""
+def test_what_a_model_without_either_shows_is_not_told(scene, monkeypatch):
+    """Nor where the model sends too little to show anything."""
     assert found(scene, Sensor(log_eps=0.05), Sensor(log_eps=0.05)) is None
+    true = sensor_with(dark={"current": 0.05})
+    assert found(scene, true, sensor_with(threshold={"on": 2.0, "off": 2.0})) is None
+    same = dase.simulate(scene, true, seed=3)
+    of_model = LightBetweenEvents.of_model
+    with monkeypatch.context() as changed:
+        changed.setattr(LightBetweenEvents, "of_model", lambda self, sensor, seed: self.steps_between(same))
+        assert found(scene, true) is None
+    assert LightBetweenEvents.of_model is of_model
     # what is asked for is left out of the model before
     assert found(scene, sensor_with(dark={"current": 0.05}), sensor_with(dark={"current": 0.05})) is not None
 
@@ -84,6 +95,15 @@ def test_too_few_steps_tell_nothing(scene):
     many = replace(DARK_STEPS, steps=len(events))
     measurement = Measurement(events, scene)
     assert find_larger_steps_in_the_dark(measurement, Sensor(), seed=0, settings=many) is None
+
+
+def test_steps_of_a_few_columns_tell_too_little_of_how_well_it_is_known(scene):
+    events = dase.simulate(scene, sensor_with(dark={"current": 0.05}), seed=3)
+    some = events.select(events.x < 8)
+    few = replace(DARK_STEPS, steps=200, of_group=60)
+    measurement = Measurement(some, scene)
+    alone = replace(few, block=1000)  # all of one block, so of one group
+    assert find_larger_steps_in_the_dark(measurement, Sensor(), seed=0, settings=alone) is None
 
 
 def test_it_is_certain_however_badly_a_model_fits():

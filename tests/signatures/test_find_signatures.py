@@ -459,14 +459,19 @@ def test_slow_doubles_show_where_nothing_is_later(rng, low, slowest, shown):
 
 
 @pytest.mark.parametrize(
-    ("share", "gap", "third", "shown"), [(0.05, 260, 0, True), (0.05, 260, 1, False), (0, 0, 0, False)]
+    ("share", "gap", "third", "shown"),
+    [(0.05, 260, 0, True), (0.05, 260, 4, False), (0.05, 260, 3.7, False), (0, 0, 0, False)],
 )
 def test_late_doubles_show_where_nothing_is_sooner_or_later(rng, share, gap, third, shown):
-    """Some hundred microseconds late; a third event after as long again is that of an edge."""
+    """Some hundred microseconds late; where a third follows, however much later, they are of an edge."""
     t, pixel = rng.uniform(0, 20e6, 60_000), rng.integers(0, 900, 60_000)
     again = np.flatnonzero(rng.random(len(t)) < share)
     late = gap * rng.uniform(0.6, 1.4, len(again))
-    seconds = [t[again] + late] + third * [t[again] + 4 * late]
+    seconds = [t[again] + late]
+    if third == 4:
+        seconds.append(t[again] + third * late)
+    elif third:
+        seconds.append(seconds[0] + third * gap)
     t = np.round(np.concatenate([t, *seconds]))
     pixel = np.concatenate([pixel, *(pixel[again] for _ in seconds)])
     order = np.argsort(t, kind="stable")
@@ -477,6 +482,17 @@ def test_late_doubles_show_where_nothing_is_sooner_or_later(rng, share, gap, thi
         assert "after the same pixel's last" in entry.sentence
         assert entry.details["gap"] == pytest.approx(gap * 1e-6, rel=0.05)
         assert entry.size == pytest.approx(share / (1 + share), rel=0.05)
+
+
+def test_times_that_events_share_by_twos_are_no_packets(rng):
+    """Nor are irregular ones whose numbers of events do not depend on the gaps before them."""
+    for many in (np.full(4000, 2), rng.integers(1, 30, 4000)):
+        stamps = np.cumsum(np.rint(300 * rng.gamma(2, 0.5, len(many))) + 1)
+        t = np.repeat(stamps, many)
+        pixel = rng.integers(0, 900, len(t))
+        x, y = (pixel % 30).astype(np.uint16), (pixel // 30).astype(np.uint16)
+        entry = dase.find_signatures(Events(t * 1e-6, x, y, pixel % 3 > 0, 30, 30))["time stamps"]
+        assert "packets" not in entry.details
 
 
 @pytest.mark.parametrize(
