@@ -74,8 +74,8 @@ class DoubleSettings:
     """Intervals that are shorter than late doubles, relative to these, at most."""
 
     late_later: float = 0.2
-    """The same of longer ones, up to `late_far`, and of third events as soon after. Two steps of a jump behind
-    a fast low-pass are as alike, but come after each frame, sooner than the pixel would have to be silent."""
+    """The same of longer ones, up to `late_far`, and of third events as soon after. Two steps of a jump
+    behind a fast low-pass are as alike, but come after each frame, sooner than pixels have to be silent."""
 
     late_usual: float = 0.5
     """Share of late doubles, at least, of other pixels than the busiest, those beyond `bulk`."""

@@ -128,7 +128,7 @@ def test_a_lens_and_a_dark_current_are_told_apart(scene):
     tried = TRIED | {"dark": EFFECTS["dark"]}
     found = diagnose_briefly(events, scene, tried)
     assert {one.effect: one.grade for one in found.findings} == {
-        "optics_blur": Grade.CERTAIN, "dark": Grade.SUPPORTED,
+        "optics_blur": Grade.CERTAIN, "dark": Grade.CERTAIN,
     }  # fmt: skip
     assert found.parameters["optics_blur.sigma"].value == pytest.approx(SIGMA, rel=0.06)
     assert found.parameters["dark.current"].value == pytest.approx(0.05, rel=0.1)
