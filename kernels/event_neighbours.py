@@ -55,8 +55,11 @@ def mark_crowded(
 
 
 @wp.func
-def bin_of(interval: wp.float64, edges: wp.array[wp.float64]):
-    """Number of the bin of an interval, which is shorter than the last edge; 0 is below the first."""
+def bin_of(
+    interval: wp.float64,  # [s], shorter than the last edge
+    edges: wp.array[wp.float64],  # (K,) [s], increasing
+):
+    """Number of the bin that an interval lies in; 0 is below the first edge."""
     kind = int(0)
     while interval >= edges[kind]:
         kind += 1

@@ -618,6 +618,7 @@ def _require_enough_events(
 def _pixels_that_help(half: PixelSubset, count: int, events: Events, grid: Grid, least: int) -> int:
     """Return how many pixels would have enough events; 0 where more of them do not help."""
     size, looked = half.trials.stimulus.width * half.trials.stimulus.height, len(half.trials.stimulus.pixels)
+    # as many more would lie where nothing is compared
     if _lacks_the_scene(half, events, grid, least):
         return 0
     # twice as many as are missing on the average: pixels differ
@@ -631,6 +632,7 @@ def _lacks_the_scene(half: PixelSubset, events: Events, grid: Grid, least: int) 
     """Return whether most events lie where the scene is not known."""
     stimulus = half.trials.stimulus
     looked, size = len(stimulus.pixels), stimulus.width * stimulus.height
+    # by their share of the array these pixels would have enough
     return bool(stimulus.holes) and _events_inside(half, events, grid) * looked >= 2 * least * size
 
 
