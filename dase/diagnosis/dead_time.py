@@ -11,13 +11,13 @@ time from frame to frame, or at a multiple. There the end says nothing.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
+from dase.diagnosis.seen_effects import with_estimate_that_was_seen
 from dase.diagnosis.state import DiagnosisTask, with_same_freedom
 from dase.effects.refractory import Refractory
 from dase.errors import InputError
@@ -250,23 +250,13 @@ def add_dead_time(
 
 def with_dead_time(diagnosis: Diagnosis, found: Signature) -> Diagnosis:
     """Return a diagnosis in which the dead time that was seen has its length, where no fit gave one."""
-    name = f"{EFFECT}.period"
-    if name in diagnosis.parameters:
-        return diagnosis
     period, low, high = (float(found.details[key]) for key in ("period", "low", "high"))
     if EFFECT in diagnosis.sensor:
         model = diagnosis.sensor[EFFECT]
         assert isinstance(model, Refractory)
         period = model.period
-    mine: Mapping[str, Estimate] = {name: Estimate(period, min(low, period), max(high, period))}
-    return replace(
-        diagnosis,
-        parameters={**diagnosis.parameters, **mine},
-        findings=tuple(
-            replace(one, parameters=mine) if one.effect == EFFECT and not one.parameters else one
-            for one in diagnosis.findings
-        ),
-    )
+    seen = Estimate(period, min(low, period), max(high, period))
+    return with_estimate_that_was_seen(diagnosis, seen, f"{EFFECT}.period")
 
 
 def _some_pixels(events: Events, settings: DeadTimeSettings, seed: int) -> NDArray[np.int64] | None:

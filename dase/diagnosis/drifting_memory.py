@@ -166,8 +166,7 @@ def drift_of(steps: LightSteps, width: int, settings: DriftSettings = DRIFT) -> 
         width: Columns of the sensor.
         settings: What counts.
     """
-    rows, columns = np.divmod(steps.pixel, width)
-    block = rows // settings.block * (width // settings.block + 1) + columns // settings.block
+    block = steps.blocks(width, settings.block)
     sides = []
     for sign in (1, -1):
         used = steps.counts & (steps.on == (sign > 0))

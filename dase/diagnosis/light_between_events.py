@@ -65,6 +65,17 @@ class LightSteps:
     again: NDArray[np.bool_]
     counts: NDArray[np.bool_]
 
+    def blocks(self, width: int, size: int) -> NDArray[np.int64]:
+        """Return the block of `size` x `size` pixels that each event is in, shape (N,).
+
+        Args:
+            width: Columns of the sensor.
+            size: Of a block [px].
+        """
+        rows, columns = np.divmod(self.pixel, width)
+        out: NDArray[np.int64] = rows // size * (width // size + 1) + columns // size
+        return out
+
 
 @dataclass(frozen=True, eq=False)
 class LightBetweenEvents:

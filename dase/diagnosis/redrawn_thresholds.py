@@ -310,8 +310,7 @@ def runs_of(
         shortest: Time that a run lasts, at least [s].
         settings: What counts.
     """
-    rows, columns = np.divmod(steps.pixel, width)
-    block = rows // settings.block * (width // settings.block + 1) + columns // settings.block
+    block = steps.blocks(width, settings.block)
     counts = steps.counts & (steps.gap < settings.longest)
     out = {}
     for sign in (1, -1):

@@ -601,17 +601,22 @@ def with_effect_of_bursts(found: Diagnosis, strength: BurstStrength) -> Diagnosi
 
 
 def with_size_that_was_seen(diagnosis: Diagnosis, found: Signature, parameter: str) -> Diagnosis:
-    """Return a diagnosis in which a parameter has the size that was seen, where no fit gave one.
+    """Return a diagnosis with the size of a signature, see `with_estimate_that_was_seen`."""
+    return with_estimate_that_was_seen(diagnosis, Estimate(found.size, found.low, found.high), parameter)
+
+
+def with_estimate_that_was_seen(diagnosis: Diagnosis, seen: Estimate, parameter: str) -> Diagnosis:
+    """Return a diagnosis in which a parameter has the value that was seen, where no fit gave one.
 
     Args:
         diagnosis: By the fits alone.
-        found: What shows the effect.
+        seen: By the events.
         parameter: With its effect, `effect.name`.
     """
     if parameter in diagnosis.parameters:
         return diagnosis
     effect = parameter.partition(".")[0]
-    mine: Mapping[str, Estimate] = {parameter: Estimate(found.size, found.low, found.high)}
+    mine: Mapping[str, Estimate] = {parameter: seen}
     return replace(
         diagnosis,
         parameters={**diagnosis.parameters, **mine},

@@ -147,7 +147,13 @@ class _Steps:
 
 @dataclass(frozen=True)
 class _Law:
-    """How the response departs from the logarithm: a current or a knee, relative to the brightest light."""
+    """How the response departs from the logarithm.
+
+    Args:
+        name: One of `LAWS`.
+        size: Of the current or the knee, relative to the brightest light.
+        left: What steps of that response differ by at different levels, relative.
+    """
 
     name: str
     size: float
@@ -222,8 +228,7 @@ def find_larger_steps_in_the_dark(
 
 def _steps_of(steps: LightSteps, brightest: float, width: int, settings: DarkStepSettings) -> list[_Steps]:
     """Return the steps that count, of ON and OFF events that follow one of the same polarity; none if few."""
-    rows, columns = np.divmod(steps.pixel, width)
-    block = rows // settings.block * (width // settings.block + 1) + columns // settings.block
+    block = steps.blocks(width, settings.block)
     out = []
     for sign in (1, -1):
         counts = steps.counts & steps.again & (steps.gap < settings.longest) & (steps.on == (sign > 0))

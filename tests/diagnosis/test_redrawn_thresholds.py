@@ -10,6 +10,7 @@ import pytest
 from helpers.brief_diagnosis import NO_LIMITS
 from helpers.frame_simulator import counted_between_frames, shaken_texture
 from helpers.own_effects import effect_that_makes
+from helpers.sensors import sensor_with
 
 import dase
 from dase.diagnosis import seen_beside_model
@@ -31,14 +32,6 @@ def found(scene, events, sensor=None, **more):
     sensor = sensor or Sensor()
     light = LightBetweenEvents.of(Measurement(events, scene), log_eps=sensor.log_eps)
     return light and find_redrawn_thresholds(light, sensor, seed=0, **more)
-
-
-def sensor_with(**effects):
-    """Return a sensor with effects, each a dict of its values."""
-    sensor = Sensor()
-    for name, values in effects.items():
-        sensor = sensor.with_effect(EFFECTS[name](**values))
-    return sensor
 
 
 @pytest.fixture(scope="module")

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from helpers.frame_simulator import shaken_texture
+from helpers.sensors import sensor_with
 
 import dase
 from dase.diagnosis.light_between_events import LightBetweenEvents
@@ -18,14 +19,6 @@ from dase.fitting.measurement import Measurement
 from dase.scenes.video import VideoScene
 from dase.signatures.kinds import KINDS, LARGER_STEPS_IN_THE_DARK
 from dase.simulation.sensor import Sensor
-
-
-def sensor_with(**effects):
-    """Return a sensor with effects, each a dict of its values."""
-    sensor = Sensor()
-    for name, values in effects.items():
-        sensor = sensor.with_effect(EFFECTS[name](**values))
-    return sensor
 
 
 @pytest.fixture(scope="module")

@@ -1,4 +1,4 @@
-"""Sensors with every effect switched on, so that no stage is left out."""
+"""Sensors with every effect switched on, so that no stage is left out, and with some by their names."""
 
 from __future__ import annotations
 
@@ -23,6 +23,14 @@ from dase.effects.shot import Shot
 from dase.effects.threshold import Threshold
 from dase.effects.vignetting import Vignetting
 from dase.effects.voltage_noise import VoltageNoise
+
+
+def sensor_with(**effects: dict[str, float]) -> dase.Sensor:
+    """Return a sensor with effects, each a dict of its values."""
+    sensor = dase.Sensor()
+    for name, values in effects.items():
+        sensor = sensor.with_effect(dase.EFFECTS[name](**values))
+    return sensor
 
 
 def full(mode: str = "reset", noise: str = "held") -> dase.Sensor:
