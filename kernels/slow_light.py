@@ -30,7 +30,8 @@ def follow_poles(
     light: wp.array2d[float],  # (P, T - 1) intensity between instants, relative to the brightest
     gaps: wp.array[float],  # (T - 1,) between instants [s]
     rate: float,  # of the first pole for each unit of light and dark current [1/s]
-    faster: float,  # of the second one, relative to the first; 0 for none
+    faster: float,  # of the second one, relative to the first; 0 where it does not go with the light
+    fixed: float,  # of a second one that does not [1/s]; 0 for none
     dark: float,  # current without light, relative to the brightest
     # out
     out: wp.array2d[float],  # (P, T)
@@ -47,9 +48,10 @@ def follow_poles(
         x = rate * gaps[n] * (light[i, n] + dark)
         decay = exponential(-x)
         behind = after - (after - seen) * mean_of_decay(x, decay) + (one - seen) * decay
-        if faster > 0.0:
-            decay = exponential(-faster * x)
-            two = behind - (behind - one) * mean_of_decay(faster * x, decay) + (two - one) * decay
+        y = faster * x + fixed * gaps[n]
+        if y > 0.0:
+            decay = exponential(-y)
+            two = behind - (behind - one) * mean_of_decay(y, decay) + (two - one) * decay
         else:
             two = behind
         one = behind
@@ -80,12 +82,13 @@ class SlowLight:
             for one in (level, light, np.diff(times))
         ]
 
-    def behind(self, cutoffs: Sequence[float], dark: float) -> NDArray[np.float32]:
+    def behind(self, cutoffs: Sequence[float], dark: float, fixed: float = 0.0) -> NDArray[np.float32]:
         """Return log intensity behind one or two poles, shape (P, T).
 
         Args:
-            cutoffs: Of the poles at the brightest light [Hz].
+            cutoffs: Of the poles that go with the light, at the brightest [Hz].
             dark: Current without light that adds to it, relative to the brightest.
+            fixed: Of a pole behind one of these, which does not go with the light [Hz]; 0 for none.
         """
         first, *second = cutoffs
         rate = 2 * math.pi * first / (1 + dark)
@@ -93,6 +96,7 @@ class SlowLight:
         out = launch.new_array(level.shape, wp.float32, self._device)
         more = second[0] / first if second else 0.0
         launch.run_kernel(
-            follow_poles, level.shape[0], [*self._inputs, rate, more, dark, out], self._device, align=16
-        )
+            follow_poles, level.shape[0],
+            [*self._inputs, rate, more, 2 * math.pi * fixed, dark, out], self._device, align=16,
+        )  # fmt: skip
         return launch.copy_to_host(out)

@@ -94,6 +94,10 @@ class LateLightSettings:
 
 LATE_LIGHT = LateLightSettings()
 
+UNLIKE_POLES = ("following", "dark", "fixed")
+"""Details of light behind a pole that goes with it and one that does not: cutoffs at intensity 1 [Hz], and
+the photocurrent at intensity 0 relative to that at 1 between them."""
+
 
 @dataclass(frozen=True)
 class Way:
@@ -102,17 +106,26 @@ class Way:
     Args:
         differ: What steps of the light then differ by, relative to the threshold.
         delay: Latency [s].
-        poles: Of the low-pass, at the brightest light, ascending [Hz].
+        poles: Of the low-pass, that go with the light, at the brightest, ascending [Hz].
+        fixed: Of a pole behind one of these that does not go with the light [Hz]; 0 for none.
+        dark: Current without light beside which they go with it, relative to the brightest.
     """
 
     differ: float
     delay: float = 0.0
     poles: tuple[float, ...] = ()
+    fixed: float = 0.0
+    dark: float = 0.0
+
+    @property
+    def kind(self) -> tuple[bool, int]:
+        """Whether it has a latency, and how many poles it has, whatever they do with the light."""
+        return self.delay > 0, len(self.poles) + (self.fixed > 0)
 
     @property
     def values(self) -> int:
         """How many values were sought; poles have a current without light, too."""
-        return (self.delay > 0) + len(self.poles) + (len(self.poles) > 0)
+        return (self.delay > 0) + (self.fixed > 0) + len(self.poles) + (len(self.poles) > 0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,7 +174,9 @@ class _Steps:
         level = np.ascontiguousarray(self.level[::every])
         return replace(self, level=level, pixel=self.pixel[mine] // every, t=self.t[mine], on=self.on[mine])
 
-    def differ(self, poles: Sequence[float] = (), dark: float = 0.0, delay: float = 0.0) -> float:
+    def differ(
+        self, poles: Sequence[float] = (), dark: float = 0.0, delay: float = 0.0, fixed: float = 0.0
+    ) -> float:
         """Return what steps differ by: half of what two thirds lie in, relative to their median.
 
         Infinite where too few count.
@@ -170,8 +185,9 @@ class _Steps:
             poles: Behind which pixels see the light: none, one or two [Hz at the brightest light].
             dark: Current without light that adds to it, relative to the brightest.
             delay: How much earlier than its event a pixel decides [s].
+            fixed: A pole behind one of these that does not go with the light [Hz]; 0 for none.
         """
-        level = self._slow_light.behind(poles, dark) if poles else self.level
+        level = self._slow_light.behind(poles, dark, fixed) if poles else self.level
         index, share = self._places(delay) if delay else self._places_at_once
         before, after = level.ravel()[index], level.ravel()[index + 1]
         here = before + (after - before) * share
@@ -257,12 +273,13 @@ def find_late_events(
     if best.differ > min(settings.alike * at_once, even):
         return ()
     # a simulator that knows frames alone is late by a frame itself
-    soonest, slowest = max(settings.soonest, 3 * frame_step), min(best.poles, default=0.0)
+    soonest = max(settings.soonest, 3 * frame_step)
+    slowest = min((one for one in (*best.poles, best.fixed) if one), default=0.0)
     if slowest > settings.fastest:
         return ()
     if dead_time > max(best.delay, 1 / (2 * math.pi * slowest) if slowest else 0.0):
         return ()
-    if any(one is not best and one.values <= best.values for one in near):
+    if any(one.kind != best.kind and one.values <= best.values for one in near):
         return ()  # a search tells more, or names both
     if best.poles and 0 < best.delay < clip_step_of(measurement.scene):
         # within a step the light is a guess: two poles of ESIM were one and 1.9 ms of the 5 between frames
@@ -272,7 +289,7 @@ def find_late_events(
         if not (best.poles and frame_step and best.differ <= settings.even):
             return ()
         best = replace(best, delay=0.0)
-    return _signatures_of(best, at_once)
+    return _signatures_of(best, at_once, math.exp(steps.brightest))
 
 
 def _looks_late(steps: _Steps, at_once: float, settings: LateLightSettings) -> bool:
@@ -284,7 +301,7 @@ def _looks_late(steps: _Steps, at_once: float, settings: LateLightSettings) -> b
 
 
 def _ways_of(steps: _Steps, settings: LateLightSettings) -> list[Way]:
-    """Return the best latency, pole, two poles, and pole with a latency."""
+    """Return the best latency, pole, two poles, of which one may be fixed, and pole with a latency."""
     few = steps.of_few()
     low, high, count = settings.delays
     begin = min(np.geomspace(low, high, count), key=lambda delay: few.differ(delay=delay))
@@ -296,6 +313,7 @@ def _ways_of(steps: _Steps, settings: LateLightSettings) -> list[Way]:
     first, dark = found["pole"][1]
     begins = {"poles": [first + 0.5, dark, 0.3]}
     begins["late pole"] = [first + 0.4, dark, math.log(0.3 / (2 * math.pi)) - first]
+    begins["fixed pole"] = [first + 0.4, dark, first + 0.6]
     for kind, logs in begins.items():
         spread = [0.25, 0.8, 0.3 if kind == "poles" else 0.6]
         found[kind] = _least(partial(_differ, few, kind), logs, spread, 32)
@@ -307,32 +325,35 @@ def _ways_of(steps: _Steps, settings: LateLightSettings) -> list[Way]:
             differ, logs = _least(whole, logs, [0.06, 0.2, 0.1][: len(logs)], 3 * len(logs))
         elif few is not steps:
             differ = whole(logs)
-        out.append(_way_at(kind, logs, differ))
+        out.append(replace(_way_at(kind, logs, steps.settings), differ=differ))
     return out
 
 
-def _way_at(kind: str, logs: Sequence[float], differ: float = math.nan) -> Way:
+def _way_at(kind: str, logs: Sequence[float], settings: LateLightSettings) -> Way:
     """Return a way.
 
     Args:
-        kind: "latency", "pole", "poles" or "late pole".
+        kind: "latency", "pole", "poles", "late pole" or "fixed pole".
         logs: Of the latency [s]; or of the first pole [Hz] and the dark current, and of how many times faster
-            the other pole is, or of the latency.
-        differ: What steps then differ by.
+            the other pole is, of the latency, or of the pole that does not go with the light [Hz].
+        settings: Of the search.
     """
     first = math.exp(logs[0])
     if kind == "latency":
-        return Way(differ, delay=first)
+        return Way(math.nan, delay=first)
+    dark = min(math.exp(logs[1]), settings.most_dark)
+    one = Way(math.nan, poles=(first,), dark=dark)
     if kind == "late pole":
-        return Way(differ, delay=math.exp(logs[2]), poles=(first,))
-    return Way(differ, poles=(first,) if kind == "pole" else (first, first * math.exp(abs(logs[2]))))
+        return replace(one, delay=math.exp(logs[2]))
+    if kind == "fixed pole":
+        return replace(one, fixed=math.exp(logs[2]))
+    return one if kind == "pole" else replace(one, poles=(first, first * math.exp(abs(logs[2]))))
 
 
 def _differ(steps: _Steps, kind: str, logs: Sequence[float]) -> float:
     """Return what steps differ by if events are late in a way, see `_way_at`."""
-    way = _way_at(kind, logs)
-    dark = min(math.exp(logs[1]), steps.settings.most_dark) if way.poles else 0.0
-    return steps.differ(way.poles, dark, way.delay)
+    way = _way_at(kind, logs, steps.settings)
+    return steps.differ(way.poles, way.dark, way.delay, way.fixed)
 
 
 def _least(
@@ -359,29 +380,46 @@ def time_of_delay(entry: Signature) -> float:
     return entry.size if entry.unit == "s" else 1 / (2 * math.pi * entry.size)
 
 
-def _signatures_of(way: Way, at_once: float) -> tuple[Signature, ...]:
+def unlike_poles_of(entry: Signature) -> tuple[float, ...]:
+    """Return two poles of a signature of which one goes with the light, see `Observations`; none of others.
+
+    Args:
+        entry: A signature of `find_late_events`.
+    """
+    return tuple(entry.details[name] for name in UNLIKE_POLES if name in entry.details)
+
+
+def _signatures_of(way: Way, at_once: float, brightest: float) -> tuple[Signature, ...]:
     """Return what a way shows: a latency, a pole or two, or a pole and a latency.
 
     Args:
         way: The best.
         at_once: What steps of the scene's light differ by, relative to the threshold.
+        brightest: Intensity of full light, at which the poles of the way are known.
     """
     alike = (
         f"from one event of a pixel to the next light then goes as far to within "
         f"{format_percent(way.differ)}, and to within {format_percent(at_once)} at once"
     )
-    said: list[tuple[str, float, str, str]] = []
-    if way.poles:
+    said: list[tuple[dict[str, float], str, str]] = []
+    if way.fixed:
+        # of the light, L, the pole has (L + dark) / (1 + dark) where the brightest is 1
+        first = way.poles[0] * (1 / brightest + way.dark) / (1 + way.dark)
+        named = f"{format_metric(first, 'Hz')}, which goes with it, and {format_metric(way.fixed, 'Hz')}"
+        unlike = first, way.dark / (1 / brightest + way.dark), way.fixed
+        details = {"poles": min(first, way.fixed), **dict(zip(UNLIKE_POLES, unlike, strict=True))}
+        said.append((details, "Hz", f"events are of light behind {named}: {alike}"))
+    elif way.poles:
         named = " and ".join(format_metric(one, "Hz") for one in way.poles)
         kind = "pole" if len(way.poles) == 1 else "poles"
-        said.append((kind, way.poles[0], "Hz", f"events are of light behind {named}: {alike}"))
+        said.append(({kind: way.poles[0]}, "Hz", f"events are of light behind {named}: {alike}"))
     if way.delay:
         late = f"events come {format_seconds(way.delay)} late: {alike}"
-        said.append(("delay", way.delay, "s", late))
+        said.append(({"delay": way.delay}, "s", late))
     return tuple(
         Signature(
-            name=LATE_EVENTS, answer=Answer.FOUND, p=0.0, size=size, unit=unit, sentence=sentence,
-            details={kind: size},
+            name=LATE_EVENTS, answer=Answer.FOUND, p=0.0, size=next(iter(details.values())), unit=unit,
+            sentence=sentence, details=details,
         )
-        for kind, size, unit, sentence in said
+        for details, unit, sentence in said
     )  # fmt: skip

@@ -15,7 +15,7 @@ from dase.diagnosis.dead_time import add_dead_time, find_dead_time
 from dase.diagnosis.drifting_memory import EFFECT as LEAKING
 from dase.diagnosis.drifting_memory import find_drifting_memory
 from dase.diagnosis.events_at_rest import find_events_at_rest, noise_is_a_pattern
-from dase.diagnosis.late_light import find_late_events, time_of_delay
+from dase.diagnosis.late_light import find_late_events, time_of_delay, unlike_poles_of
 from dase.diagnosis.light_between_events import LightBetweenEvents
 from dase.diagnosis.redrawn_thresholds import EFFECT as JITTER
 from dase.diagnosis.redrawn_thresholds import find_jitter_beside, is_unlike_fit
@@ -68,7 +68,7 @@ def look_beside_model(
     seen = _look_for_dead_time(task, seen, measurement, model)
     seen = _look_at_thresholds(task, seen, measurement, model)
     seen = _look_at_steps_in_the_dark(task, seen, measurement, model)
-    seen = _look_for_late_events(task, seen, measurement, model)
+    seen = _look_for_late_events(state, seen, measurement, model)
     seen = _without_pattern_of_noise(state, seen, measurement, model)
     certain = frozenset(seen.effects) & frozenset(task.effects) - task.given
     noise = seen.entry_of(NOISE_AT_REST)
@@ -262,9 +262,10 @@ def _look_at_steps_in_the_dark(
 
 
 def _look_for_late_events(
-    task: DiagnosisTask, seen: SeenEffects, measurement: Measurement, model: FittedModel
+    state: DiagnosisState, seen: SeenEffects, measurement: Measurement, model: FittedModel
 ) -> SeenEffects:
     """Return what is seen, with the ways in which events are late."""
+    task = state.task
     known = makers_of(LATE_EVENTS, {**EFFECTS, **task.effects})
     # a bus makes events late, too, and a lamp and bursts make some that light does not
     hidden = seen.lamp or seen.bursts is not None or seen.full_bus
@@ -279,6 +280,9 @@ def _look_for_late_events(
         dead_time=float(dead.details["period"]) if dead else 0.0,
         device=str(task.evidence.train.trials.device),
     )
+    unlike = next((poles for one in found if (poles := unlike_poles_of(one))), ())
+    if unlike:
+        state.try_unlike_poles(unlike)
     return replace(seen, entries=(*seen.entries, *found))
 
 

@@ -135,6 +135,7 @@ class DiagnosisState:
         evaluations_before: Simulations that were run before the measurement was split anew.
         samples_before: Pixels times samples of those.
         double_gap: Mean time from an event to its double [s], which are tried where it is not 0.
+        unlike_poles: Two that events are seen to be behind, see `Observations`; empty where they are not.
     """
 
     task: DiagnosisTask
@@ -147,6 +148,7 @@ class DiagnosisState:
     evaluations_before: int = 0
     samples_before: int = 0
     double_gap: float = 0.0
+    unlike_poles: tuple[float, ...] = ()
 
     @property
     def evaluations(self) -> int:
@@ -167,12 +169,19 @@ class DiagnosisState:
         self.double_gap = gap
         self.task = replace(self.task, evidence=replace(self.task.evidence, double_gap=gap))
 
+    def try_unlike_poles(self, poles: tuple[float, ...]) -> None:
+        """Let two poles be tried of which one goes with the light, see `Observations`: they are seen."""
+        self.unlike_poles = poles
+        self.task = replace(self.task, evidence=replace(self.task.evidence, unlike_poles=poles))
+
     def split_anew(self, evidence: SplitMeasurement) -> None:
         """Go on with a split of which all of the time is fitted; what was run before counts on."""
         self.evaluations_before, self.samples_before = self.evaluations, self.samples
         self.task = replace(self.task, evidence=evidence, all_time=True)
         if self.double_gap:
             self.try_doubles(self.double_gap)
+        if self.unlike_poles:
+            self.try_unlike_poles(self.unlike_poles)
 
     def count_as_given(self, name: str) -> None:
         """Count an effect as one that a model has before the search."""

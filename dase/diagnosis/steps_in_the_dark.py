@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -75,6 +75,9 @@ class DarkStepSettings:
     looks: int = 24
     """At either, to begin with."""
 
+    thinned: int = 24_000
+    """Steps of either polarity for these, at most."""
+
     steps: int = 2000
     """Of either polarity, at least."""
 
@@ -122,27 +125,45 @@ class _Steps:
     after: Array
     sign: int
     block: NDArray[np.int64]
+    _levels: dict[int, list[tuple[Array, Array]]] = field(default_factory=dict, repr=False)
 
     def part(self, group: int, groups: int) -> _Steps:
         """Return those of every so many blocks."""
         mine = self.block % groups == group
         return _Steps(self.before[mine], self.after[mine], self.sign, self.block[mine])
 
+    def thinned(self, most: int) -> _Steps:
+        """Return so many of them at most, spread evenly."""
+        every = slice(None, None, max(1, -(-len(self.after) // most)))
+        return _Steps(self.before[every], self.after[every], self.sign, self.block[every])
+
     def differ(self, response: Callable[[Array], Array], bins: int) -> float:
         """Return what the medians of steps of a response differ by at different levels, relative.
 
         Infinite where a level has no steps: the light of many is the same.
         """
-        level = self.before + self.after
-        if len(level) < bins:
+        levels = self._by_level(bins)
+        if not levels:
             return math.inf
-        at = np.searchsorted(np.quantile(level, np.arange(1, bins) / bins), level)
-        if np.bincount(at, minlength=bins).min() == 0:
-            return math.inf
-        moved = self.sign * (response(self.after) - response(self.before))
-        medians = np.array([np.median(moved[at == n]) for n in range(bins)])
+        medians = np.array(
+            [np.median(self.sign * (response(after) - response(before))) for before, after in levels]
+        )
         mean = float(medians.mean())
         return float(medians.std()) / mean if mean > 0 else math.inf
+
+    def _by_level(self, bins: int) -> list[tuple[Array, Array]]:
+        """Return the levels of light before and after the steps of each of some levels; none if one is empty.
+
+        Found once, for the same steps are looked at with many responses.
+        """
+        if bins not in self._levels:
+            level = self.before + self.after
+            edges = np.quantile(level, np.arange(1, bins) / bins) if len(level) else np.zeros(bins - 1)
+            at = np.searchsorted(edges, level)
+            mine = [np.flatnonzero(at == n) for n in range(bins)]
+            full = min(len(one) for one in mine) > 0
+            self._levels[bins] = [(self.before[one], self.after[one]) for one in mine] if full else []
+        return self._levels[bins]
 
 
 @dataclass(frozen=True)
@@ -263,11 +284,13 @@ def _fit(steps: list[_Steps], name: str, settings: DarkStepSettings) -> _Law:
     """Return the size of a current or a knee with which steps differ least."""
     low, high = settings.range_of(name)
 
-    def left(log: float) -> float:
-        return _differ(steps, LAWS[name](math.exp(log)), settings)
+    def left(log: float, of: list[_Steps] = steps) -> float:
+        return _differ(of, LAWS[name](math.exp(log)), settings)
 
+    # where the least is, few steps tell; what it is, all do
+    few = [one.thinned(settings.thinned) for one in steps]
     tried = np.linspace(math.log(low), math.log(high), settings.looks)
-    begin = int(np.argmin([left(one) for one in tried]))
+    begin = int(np.argmin([left(one, few) for one in tried]))
     ends = tried[max(begin - 1, 0)], tried[min(begin + 1, len(tried) - 1)]
     found = minimize_scalar(left, bounds=ends, method="bounded", options={"xatol": 0.01})
     at, least = min((left(tried[begin]), float(tried[begin])), (float(found.fun), float(found.x)))[::-1]

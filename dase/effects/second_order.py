@@ -262,8 +262,12 @@ class SecondOrder(Effect):
     def candidates(cls, observed: Observations) -> list[Self]:
         """Return that of constant damping: `dase.fit` asks for the circuit's, too.
 
-        Where events are of a simulator that works frame by frame, it goes in steps.
+        Where events are of a simulator that works frame by frame, it goes in steps; where they are behind a
+        pole that goes with the light and one that does not, it is of these.
         """
+        if observed.unlike_poles:
+            first, dark, second = observed.unlike_poles
+            return [cls.of_poles(Bandwidth(cutoff=first, dark=dark), cutoff=second)]
         return [cls(poles="steps", damping=1.0) if observed.clip_step else cls()]
 
     def by_other_laws(self) -> list[Self]:

@@ -107,6 +107,7 @@ class SplitMeasurement:
             not, see `frame_step_of`.
         clip_frames: Time from frame to frame of a clip [s], 0 of another scene.
         double_gap: Mean time from an event to its double [s] where pixels are seen to send twice, else 0.
+        unlike_poles: Two that events are seen to be behind, see `Observations`; empty where they are not.
     """
 
     train: PixelSubset
@@ -125,6 +126,7 @@ class SplitMeasurement:
     frame_step: float = 0.0
     clip_frames: float = 0.0
     double_gap: float = 0.0
+    unlike_poles: tuple[float, ...] = ()
 
     def observe(self, *, idle_bus: float) -> Observations:
         """Return what effects may choose their candidates by, see `Observations`."""
@@ -149,6 +151,7 @@ class SplitMeasurement:
             clip_step=self.frame_step,
             clip_frames=self.clip_frames,
             double_gap=self.double_gap,
+            unlike_poles=self.unlike_poles,
         )
 
     @property

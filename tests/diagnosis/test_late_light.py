@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from helpers.frame_simulator import HEIGHT, WIDTH, shaken_texture
 
-from dase.diagnosis.late_light import find_late_events
+from dase.diagnosis.late_light import find_late_events, unlike_poles_of
+from dase.effects.bandwidth import Bandwidth
+from dase.effects.base import Observations
+from dase.effects.second_order import SecondOrder
 from dase.events import Events
 from dase.fitting.measurement import Measurement
 from dase.scenes.video import VideoScene
@@ -20,6 +25,7 @@ def late_events(
     *,
     delay: float = 0.0,
     poles: tuple[float, ...] = (),
+    fixed: float = 0.0,
     spread: float = 0.02,
     dark: float = 0.1,
     even: bool = False,
@@ -30,6 +36,7 @@ def late_events(
         scene: Frames of light; its logarithm runs straight between them.
         delay: From the crossing to the event [s].
         poles: Of a low-pass, at full light and as much lower as light is, with the dark current [Hz].
+        fixed: Of a low-pass behind these that is the same in all light [Hz]; 0 for none.
         spread: By which thresholds of 0.2 differ from event to event, relative.
         dark: That current, relative to full light.
         even: Whether the light itself runs straight, not its logarithm.
@@ -38,7 +45,8 @@ def late_events(
     times = scene.sample_times()
     level = np.log(scene.frames(times).astype(np.float64) + 1e-3)
     brightest = np.quantile(np.exp(level), 0.99)
-    seen = [level[0].copy() for _ in poles]
+    cutoffs = [(one, 1.0) for one in poles] + [(fixed, 0.0)] * (fixed > 0)
+    seen = [level[0].copy() for _ in cutoffs]
     memory = level[0].copy()
     last = level[0].copy()
     threshold = 0.2 * (1 + spread * rng.standard_normal(last.shape))
@@ -49,8 +57,8 @@ def late_events(
             part = (n + 1) / FINE
             now = np.log(np.exp(a) + (np.exp(b) - np.exp(a)) * part) if even else a + (b - a) * part
             share = (np.exp(now) / brightest + dark) / (1 + dark)
-            for k, cutoff in enumerate(poles):
-                seen[k] += (1 - np.exp(-2 * np.pi * cutoff * share * step)) * (now - seen[k])
+            for k, (cutoff, goes) in enumerate(cutoffs):
+                seen[k] += (1 - np.exp(-2 * np.pi * cutoff * share**goes * step)) * (now - seen[k])
                 now = seen[k].copy()
             y, x = np.nonzero(np.abs(now - memory) >= threshold)
             sign = np.sign(now - memory)[y, x]
@@ -91,6 +99,34 @@ def test_two_poles_are_told(scene):
     found = told(scene, poles=(40.0, 60.0))
     assert set(found) == {"poles"}
     assert 30 < found["poles"] < 55
+
+
+@pytest.mark.slow
+def test_a_pole_that_goes_with_the_light_before_one_that_does_not_is_told(scene):
+    """The circuit's node and its buffer: neither a latency beside a pole nor two poles alike."""
+    events = late_events(scene, poles=(60.0,), fixed=40.0)
+    (found,) = find_late_events(Measurement(events, scene), log_eps=1e-3)
+    first, dark, second = unlike_poles_of(found)
+    assert second == pytest.approx(40.0, rel=0.15)
+    assert found.details["poles"] == found.size == second
+    # the events' pole has 60 Hz at full light, and as much of it as there is photocurrent elsewhere
+    light = np.quantile(scene.frames(scene.sample_times()), 0.99)
+    assert first * (dark + (1 - dark) * light) == pytest.approx(60.0, rel=0.15)
+    assert first * dark == pytest.approx(60.0 * 0.1 / 1.1, rel=0.4)
+
+
+@pytest.mark.slow
+def test_two_poles_alike_are_not_unlike(scene):
+    events = late_events(scene, poles=(40.0, 60.0))
+    (found,) = find_late_events(Measurement(events, scene), log_eps=1e-3)
+    assert unlike_poles_of(found) == ()
+
+
+def test_poles_that_are_seen_to_be_unlike_are_tried():
+    usual = Observations(100.0, 0.0, 0.0, "down", 1e5, 0.1, 0.1)
+    (tried,) = SecondOrder.candidates(replace(usual, unlike_poles=(80.0, 0.05, 30.0)))
+    assert tried == SecondOrder.of_poles(Bandwidth(cutoff=80.0, dark=0.05), cutoff=30.0)
+    assert SecondOrder.candidates(usual)[0].poles == "alike"
 
 
 @pytest.mark.slow
