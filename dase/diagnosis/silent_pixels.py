@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
+from scipy.ndimage import find_objects, label
 
 from dase.diagnosis.model_at_pixels import count_of_model
 from dase.effects.dead import Dead
@@ -42,8 +43,19 @@ class SilentPixelSettings:
     """Moments at which the light of all pixels is looked at."""
 
     sent: float = 8.0
-    """Events that all of the eight neighbours must have but one, which may be dead, too: of pixels that are
+    """Events that all of the eight neighbours must have but one, whatever that does: of pixels that are
     alive, chance silences one in 3,000 where 8 are expected, and more at the edge of what moves."""
+
+    alive: int = 3
+    """Neighbours that must have as many where others send nothing at all: in two lines of dead ones and at
+    the edge of a patch."""
+
+    patch: int = 12
+    """Silent pixels side by side, at least, for that: of 130 clips three had up to five at the edge of what
+    moves, with three and with five neighbours that send."""
+
+    widest: int = 24
+    """Shorter side of a patch of dead pixels, at most: more are switched off."""
 
     change: float = 0.6
     """Range of the log intensity that a pixel must see: most thresholds are far below it."""
@@ -160,20 +172,71 @@ def find_silent_pixels(
         events.y.astype(np.int64) * events.width + events.x, minlength=events.width * events.height
     ).reshape(events.height, events.width)
     inside = (slice(1, -1), slice(1, -1))
-    around = _neighbours(counts)
-    brightness = mean[inside] / np.median(_neighbours(mean), 0)
-    asked = (
-        ((around >= settings.sent).sum(0) >= len(around) - 1)
-        & (change[inside] >= np.maximum(settings.change, settings.alike * np.median(_neighbours(change), 0)))
-        & (brightness >= settings.alike) & (brightness <= 1 / settings.alike)
-    )  # fmt: skip
+    asked, patchy = _are_like_neighbours_that_send(counts, change, mean, settings)
     if measurement.trust is not None:
-        asked &= _ever_trusted(measurement.trust, scene, times)[inside]
+        trusted = _ever_trusted(measurement.trust, scene, times)[inside]
+        asked, patchy = asked & trusted, patchy & trusted
     sent = counts[inside]
-    rows, columns = np.nonzero(asked & (sent == 0))
+    # those in the middle of a patch have no neighbours that send, and are as dead as those at its edge
+    silent = (sent == 0) & (change[inside] >= settings.change)
+    patches, _ = label(silent, np.ones((3, 3)))
+    boxes, sizes = find_objects(patches), np.bincount(patches.ravel())
+    dead_patches = [
+        n for n in np.unique(patches[patchy & silent]).tolist()
+        if sizes[n] >= settings.patch and not _is_switched_off(boxes[n - 1], silent.shape, settings)
+    ]  # fmt: skip
+    dead = (asked & silent) | (silent & np.isin(patches, dead_patches))
+    rows, columns = np.nonzero(dead)
     pixels = (rows + 1) * np.int64(events.width) + columns + 1
     hardly = np.count_nonzero(asked & (sent > 0) & (sent <= settings.hardly))
-    return SilentPixels(pixels, int(np.count_nonzero(asked)), settings, int(hardly))
+    return SilentPixels(pixels, int(np.count_nonzero(asked | dead)), settings, int(hardly))
+
+
+def _is_switched_off(box: tuple[slice, slice], shape: tuple[int, ...], settings: SilentPixelSettings) -> bool:
+    """Return whether silent pixels side by side are a region outside of the one that a camera reads.
+
+    Args:
+        box: Rows and columns that they lie in.
+        shape: Rows and columns of all pixels that are asked.
+        settings: How large a patch of dead pixels is, at most.
+    """
+    # across the longer side
+    short = min((0, 1), key=lambda axis: box[axis].stop - box[axis].start)
+    begin, end = box[short].start, box[short].stop
+    return begin == 0 or bool(end == shape[short]) or bool(end - begin > settings.widest)
+
+
+def _are_like_neighbours_that_send(
+    counts: NDArray[np.int64],
+    change: NDArray[np.float32],
+    mean: NDArray[np.float32],
+    settings: SilentPixelSettings,
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Return of which pixels events are expected, shape (H - 2, W - 2): those at the border are not asked.
+
+    First by neighbours all of which send but one, then also by some where the others send nothing at all.
+
+    Args:
+        counts: Events of all pixels, shape (H, W).
+        change: Range of their log intensity, shape (H, W).
+        mean: Their mean intensity, shape (H, W).
+        settings: What is expected.
+    """
+    around = _neighbours(counts)
+    sends, says = around >= settings.sent, (around >= settings.sent) | (around == 0)
+    alive, most = sends.sum(0), len(around) - 1
+    places = (alive >= settings.alive) & ((alive >= most) | (says.sum(0) >= most))
+    rows, columns = np.nonzero(places)
+    which = (slice(None), rows, columns)
+    # whom to be like: of all where all send, else of those that do
+    those = np.where(sends[which] | (alive[rows, columns] >= most), 1.0, np.nan)
+    usual_change = np.nanmedian(_neighbours(change)[which] * those, 0)
+    brightness = mean[1:-1, 1:-1][rows, columns] / np.nanmedian(_neighbours(mean)[which] * those, 0)
+    places[rows, columns] = (
+        (change[1:-1, 1:-1][rows, columns] >= np.maximum(settings.change, settings.alike * usual_change))
+        & (brightness >= settings.alike) & (brightness <= 1 / settings.alike)
+    )  # fmt: skip
+    return places & (alive >= most), places
 
 
 def without_the_explained_silence(

@@ -23,27 +23,44 @@ SHARE = 0.5
 clips of two pans, 0.01 at most of the lamps of six clips (development)."""
 
 
-def is_tone_of_light(
-    entry: Signature, measurement: Measurement, *, log_eps: float, share: float = SHARE
-) -> bool:
+SHARE_AT_HALF = 0.1
+"""The same at half of the frame rate, as often as a fan shows other blades in turns: what light does between
+two frames is a guess, and makes most of such a tone (0.19 in a fan's clip, development)."""
+
+
+def is_tone_of_light(entry: Signature, measurement: Measurement, *, log_eps: float) -> bool:
     """Return whether the light of a clip swings at a frequency about as much as its events do.
 
     Args:
         entry: Flicker that is seen in the events.
         measurement: Its scene is a clip.
         log_eps: Added to intensities before the logarithm.
-        share: Of the swing of the events that the light has to have.
     """
     known = entry.details
     low, high = (known.get(f"frequency_{end}", known["frequency"]) for end in ("low", "high"))
+    at_half = low - _resolved(measurement) < _fastest_tone(measurement) < high + _resolved(measurement)
+    share = SHARE_AT_HALF if at_half else SHARE
     return swing_of_light(measurement, low, high, log_eps=log_eps) >= share * entry.size
+
+
+def _fastest_tone(measurement: Measurement) -> float:
+    """Return half of the rate of the instants at which the light that is compared is known [Hz]."""
+    times = times_that_are_compared(measurement)
+    return 0.5 / float(np.median(np.diff(times))) if len(times) > 1 else 0.0
+
+
+def _resolved(measurement: Measurement) -> float:
+    """Return how well a tone of the light is known, by half a turn over the time that is compared [Hz]."""
+    times = times_that_are_compared(measurement)
+    return 0.5 / float(times[-1] - times[0]) if len(times) > 1 else 0.0
 
 
 def swing_of_light(measurement: Measurement, low: float, high: float, *, log_eps: float) -> float:
     """Return by how much a tone moves the change of the light of all pixels, relative to all that changes.
 
     Of events the same is the swing of ON less OFF, relative to their rate. Frames cannot tell a tone above
-    half of their rate from a slower one, so that there is none.
+    half of their rate from a slower one, so that there is none; at half of it, a fan shows other blades in
+    turns.
 
     Args:
         measurement: Its scene is a clip; of the time that is compared.
@@ -52,8 +69,13 @@ def swing_of_light(measurement: Measurement, low: float, high: float, *, log_eps
         log_eps: Added to intensities before the logarithm.
     """
     times, scene = times_that_are_compared(measurement), measurement.scene
-    if len(times) < 3 or high > 0.5 / float(np.median(np.diff(times))):
+    if len(times) < 3:
         return 0.0
+    fastest = _fastest_tone(measurement)
+    resolved = _resolved(measurement)
+    if low > fastest + resolved:
+        return 0.0
+    high = min(high, fastest)
     number = scene.width * scene.height
     every = max(1, -(-number * len(times) // SAMPLES))
     pixels = np.arange(0, number, every, dtype=np.int32)
@@ -62,8 +84,6 @@ def swing_of_light(measurement: Measurement, low: float, high: float, *, log_eps
     if whole <= 0:
         return 0.0
     net -= net.mean()
-    # two tones are told apart by one turn over all of the time
-    resolved = 1 / float(times[-1] - times[0])
     middle = 0.5 * (times[1:] + times[:-1])
-    tried = np.arange(low - 0.5 * resolved, high + 0.6 * resolved, 0.5 * resolved)
+    tried = np.arange(min(low, high) - resolved, high + 1.1 * resolved, resolved)
     return max(float(abs(net @ np.exp(-2j * np.pi * one * middle))) for one in tried) / whole

@@ -71,6 +71,24 @@ def test_silent_pixels_are_the_dead_ones(scene):
     assert str(len(found.pixels)) in found.sentence
 
 
+@pytest.mark.parametrize("shape", ["columns", "patch"])
+def test_lines_and_patches_of_dead_pixels_are_found_whole(scene, shape):
+    """Their neighbours are dead, too, and those in the middle of a patch have no others."""
+    events = dase.simulate(scene, Sensor(), seed=5)
+    dead = np.zeros((HEIGHT, WIDTH), np.bool_)
+    if shape == "columns":
+        dead[:, [20, 41, 42]] = True
+    else:
+        dead[30:38, 40:49] = True
+    alive = counts_of(events) > 0
+    events = events.select(~dead[events.y, events.x])
+    found = find_silent_pixels(Measurement(events, scene), log_eps=1e-3)
+    assert found.found
+    there = np.flatnonzero(dead.ravel() & alive)
+    assert np.isin(found.pixels, there).all()
+    assert len(found.pixels) > 0.75 * len(there)
+
+
 @pytest.mark.parametrize("effect", [
     EFFECTS["mismatch"](spread=0.3), EFFECTS["jitter"](spread=0.4), EFFECTS["dark"](current=0.05),
     EFFECTS["bandwidth"](cutoff=20.0), EFFECTS["refractory"](period=0.02), EFFECTS["readout"](rate=2e5),

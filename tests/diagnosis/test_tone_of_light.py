@@ -60,6 +60,21 @@ def test_a_tone_is_looked_for_as_far_as_it_is_known(rng):
     assert not is_tone_of_light(flicker(110.0, 0.1), part, log_eps=0.01)
 
 
+def test_a_fan_that_shows_other_blades_in_turns_is_no_lamp_of_half_the_frame_rate(rng):
+    """What light does between two frames is a guess: there a part of the swing is enough."""
+    seen = pan(rng, 57.0)
+    frames = seen.scene.frames(seen.scene.sample_times())
+    turns = seen_of(
+        VideoScene(frames * (1 + 0.02 * (np.arange(320) % 2))[:, None, None], np.arange(320) * EVERY)
+    )
+    swing = swing_of_light(turns, 199.99, 200.01, log_eps=0.01)
+    assert swing > 0.05
+    entry = flicker(200.0, 4 * swing)
+    assert is_tone_of_light(entry, turns, log_eps=0.01)
+    assert not is_tone_of_light(entry, seen, log_eps=0.01)
+    assert not is_tone_of_light(flicker(180.0, 4 * swing), turns, log_eps=0.01)
+
+
 @pytest.mark.parametrize("swing", [0.0, 0.2])
 def test_a_lamp_is_the_scene_s_if_the_clip_has_it(rng, swing):
     assert is_tone_of_light(flicker(120.0, 0.2), pan(rng, 57.0, swing), log_eps=0.01) is bool(swing)
