@@ -181,8 +181,10 @@ def find_silent_pixels(
     silent = (sent == 0) & (change[inside] >= settings.change)
     patches, _ = label(silent, np.ones((3, 3)))
     boxes, sizes = find_objects(patches), np.bincount(patches.ravel())
+    # between a camera's frames light is a guess, by which whole patches may see none
+    edges = patches[patchy & silent & (not isinstance(scene, CameraScene))]
     dead_patches = [
-        n for n in np.unique(patches[patchy & silent]).tolist()
+        n for n in np.unique(edges).tolist()
         if sizes[n] >= settings.patch and not _is_switched_off(boxes[n - 1], silent.shape, settings)
     ]  # fmt: skip
     dead = (asked & silent) | (silent & np.isin(patches, dead_patches))

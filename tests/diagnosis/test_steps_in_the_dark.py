@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,14 +11,16 @@ from helpers.frame_simulator import shaken_texture
 from helpers.sensors import sensor_with
 
 import dase
+from dase.diagnosis import seen_beside_model
 from dase.diagnosis.light_between_events import LightBetweenEvents
-from dase.diagnosis.seen_effects import with_size_that_was_seen
+from dase.diagnosis.seen_effects import SeenEffects, with_size_that_was_seen
 from dase.diagnosis.steps_in_the_dark import DARK_STEPS, find_larger_steps_in_the_dark
 from dase.effects import EFFECTS
 from dase.effects.made_signatures import told_by
 from dase.fitting.measurement import Measurement
 from dase.scenes.video import VideoScene
-from dase.signatures.kinds import KINDS, LARGER_STEPS_IN_THE_DARK
+from dase.signatures.kinds import KINDS, LARGER_STEPS_IN_THE_DARK, TIME_STAMPS
+from dase.signatures.result import Answer, Signature
 from dase.simulation.sensor import Sensor
 
 
@@ -97,6 +100,27 @@ def test_steps_of_a_few_columns_tell_too_little_of_how_well_it_is_known(scene):
     measurement = Measurement(some, scene)
     alone = replace(few, block=1000)  # all of one block, so of one group
     assert find_larger_steps_in_the_dark(measurement, Sensor(), seed=0, settings=alone) is None
+
+
+@pytest.mark.parametrize(
+    ("details", "late"),
+    [
+        ({"step": 1e-4}, False), ({"step": 1e-3}, True), ({"line": 1e-5, "period": 1.2e-3}, True),
+        ({"line": 1e-6, "period": 1e-4}, False), ({}, False),
+    ],
+)  # fmt: skip
+def test_steps_tell_nothing_where_a_scan_or_a_clock_stamps_events_late(details, late, monkeypatch):
+    """Light goes on until they are stamped: beside a scan of 1.2 ms a current was certain in a sealed run."""
+    asked = []
+    monkeypatch.setattr(
+        seen_beside_model, "find_larger_steps_in_the_dark", lambda *_, **more: asked.append(more)
+    )
+    stamps = Signature(name=TIME_STAMPS, answer=Answer.FOUND, details=details, sentence="")
+    seen = SeenEffects((stamps,))
+    task = SimpleNamespace(evidence=SimpleNamespace(contradiction=""), given=frozenset(), seed=0)
+    model = SimpleNamespace(sensor=Sensor())
+    assert seen_beside_model._look_at_steps_in_the_dark(task, seen, None, model) is seen
+    assert bool(asked) is not late
 
 
 def test_it_is_certain_however_badly_a_model_fits():
