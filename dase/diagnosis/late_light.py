@@ -263,8 +263,9 @@ def find_late_events(
     if light is None:
         return ()
     steps = _Steps.of(light, settings, device)
+    # infinite, too, where light is so late that it goes the other way as often: some way may tell how late
     at_once = steps.differ()
-    if not math.isfinite(at_once) or not _looks_late(steps, at_once, settings):
+    if not _looks_late(steps, at_once, settings):
         return ()
     ways = _ways_of(steps, settings)
     best = min(ways, key=lambda one: one.differ)
@@ -397,9 +398,10 @@ def _signatures_of(way: Way, at_once: float, brightest: float) -> tuple[Signatur
         at_once: What steps of the scene's light differ by, relative to the threshold.
         brightest: Intensity of full light, at which the poles of the way are known.
     """
+    usual = f"to within {format_percent(at_once)}" if math.isfinite(at_once) else "either way"
     alike = (
         f"from one event of a pixel to the next light then goes as far to within "
-        f"{format_percent(way.differ)}, and to within {format_percent(at_once)} at once"
+        f"{format_percent(way.differ)}, and {usual} at once"
     )
     said: list[tuple[dict[str, float], str, str]] = []
     if way.fixed:

@@ -102,6 +102,15 @@ def test_two_poles_are_told(scene):
 
 
 @pytest.mark.slow
+def test_two_poles_are_told_where_light_goes_the_other_way_at_once(scene):
+    """At the events themselves it goes up as often as down, so that they are as far from even as can be."""
+    events = late_events(scene, poles=(12.0, 18.0))
+    (found,) = find_late_events(Measurement(events, scene), log_eps=1e-3)
+    assert found.details["poles"] == pytest.approx(12.0, rel=0.1)
+    assert "either way at once" in found.sentence
+
+
+@pytest.mark.slow
 def test_a_pole_that_goes_with_the_light_before_one_that_does_not_is_told(scene):
     """The circuit's node and its buffer: neither a latency beside a pole nor two poles alike."""
     events = late_events(scene, poles=(60.0,), fixed=40.0)
