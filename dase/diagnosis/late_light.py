@@ -1,7 +1,8 @@
 """Whether events are late, and in which way: by how far light goes from one event of a pixel to the next.
 
 That is the threshold each time, of the light that the pixel sees when it decides. If events come later by a
-fixed time, or light is behind a pole or two, it is so of that light and not of the scene's. So the light is
+fixed time, or light is behind a pole or two, which may go with it or not, it is so of that light and not of
+the scene's. So the light is
 taken back by a latency, a pole, two poles and both, and the way and the values are sought with which light
 goes equally far. No model is fitted: thresholds may be any, noise and leaks add the same to all, and
 hundreds of thousands of steps tell ways apart that statistics do not.
@@ -83,7 +84,8 @@ class LateLightSettings:
 
     decided: float = 1.08
     """Times what steps differ by in the best way that they do in every simpler way, and in every other of as
-    many values, at least, for it to be told."""
+    many values, at least, for it to be told; two poles of either kind are two poles, and one of them is fixed
+    if they differ as much more without."""
 
     least: int = 1000
     """Steps of a polarity, at least."""
@@ -179,13 +181,29 @@ class _Steps:
     ) -> float:
         """Return what steps differ by: half of what two thirds lie in, relative to their median.
 
-        Infinite where too few count.
+        Infinite where too few count, and where light goes the other way as often as with the events.
 
         Args:
             poles: Behind which pixels see the light: none, one or two [Hz at the brightest light].
             dark: Current without light that adds to it, relative to the brightest.
             delay: How much earlier than its event a pixel decides [s].
             fixed: A pole behind one of these that does not go with the light [Hz]; 0 for none.
+        """
+        out = []
+        for moved in self._moved(poles, dark, delay, fixed):
+            low, middle, high = np.quantile(moved, [0.16, 0.5, 0.84])
+            out.append(float(high - low) / 2 / float(middle) if middle > 0 else math.inf)
+        return float(np.mean(out)) if out else math.inf
+
+    @property
+    def are_enough(self) -> bool:
+        """Whether steps of a polarity are enough at once."""
+        return bool(self._moved((), 0.0, 0.0, 0.0))
+
+    def _moved(self, poles: Sequence[float], dark: float, delay: float, fixed: float) -> list[Levels]:
+        """Return how far light goes from event to event, by the arguments of `differ`; (M,) of each polarity.
+
+        Of polarities with enough steps.
         """
         level = self._slow_light.behind(poles, dark, fixed) if poles else self.level
         index, share = self._places(delay) if delay else self._places_at_once
@@ -196,11 +214,9 @@ class _Steps:
         for last, sign in self._pairs:
             now, then = here[last], here[last - 1]
             moved = (sign * (now - then))[np.minimum(now, then) > darkest]
-            if len(moved) < self.settings.least:
-                continue
-            low, middle, high = np.quantile(moved, [0.16, 0.5, 0.84])
-            out.append(float(high - low) / 2 / float(middle) if middle > 0 else math.inf)
-        return float(np.mean(out)) if out else math.inf
+            if len(moved) >= self.settings.least:
+                out.append(moved)
+        return out
 
     def _places(self, delay: float) -> tuple[NDArray[np.int64], Levels]:
         """Return where in the light events were decided: the instant before, and how far on to the next.
@@ -263,13 +279,14 @@ def find_late_events(
     if light is None:
         return ()
     steps = _Steps.of(light, settings, device)
-    # infinite, too, where light is so late that it goes the other way as often: some way may tell how late
     at_once = steps.differ()
-    if not _looks_late(steps, at_once, settings):
+    if not steps.are_enough or not _looks_late(steps, at_once, settings):
         return ()
     ways = _ways_of(steps, settings)
     best = min(ways, key=lambda one: one.differ)
     near = [one for one in ways if one.differ < settings.decided * best.differ]
+    # that one of two poles is fixed must be told from two that go with the light
+    best = next((one for one in near if best.fixed and len(one.poles) == 2), best)
     even = settings.even_in_frames if frame_step else settings.even
     if best.differ > min(settings.alike * at_once, even):
         return ()
@@ -290,7 +307,7 @@ def find_late_events(
         if not (best.poles and frame_step and best.differ <= settings.even):
             return ()
         best = replace(best, delay=0.0)
-    return _signatures_of(best, at_once, math.exp(steps.brightest))
+    return _signatures_of(best, at_once, math.exp(steps.brightest), log_eps)
 
 
 def _looks_late(steps: _Steps, at_once: float, settings: LateLightSettings) -> bool:
@@ -390,13 +407,14 @@ def unlike_poles_of(entry: Signature) -> tuple[float, ...]:
     return tuple(entry.details[name] for name in UNLIKE_POLES if name in entry.details)
 
 
-def _signatures_of(way: Way, at_once: float, brightest: float) -> tuple[Signature, ...]:
+def _signatures_of(way: Way, at_once: float, brightest: float, log_eps: float) -> tuple[Signature, ...]:
     """Return what a way shows: a latency, a pole or two, or a pole and a latency.
 
     Args:
         way: The best.
         at_once: What steps of the scene's light differ by, relative to the threshold.
-        brightest: Intensity of full light, at which the poles of the way are known.
+        brightest: Intensity of full light, and `log_eps`, at which the poles of the way are known.
+        log_eps: Added to intensities before the logarithm.
     """
     usual = f"to within {format_percent(at_once)}" if math.isfinite(at_once) else "either way"
     alike = (
@@ -406,10 +424,11 @@ def _signatures_of(way: Way, at_once: float, brightest: float) -> tuple[Signatur
     said: list[tuple[dict[str, float], str, str]] = []
     if way.fixed:
         # of the light, L, the pole has (L + dark) / (1 + dark) where the brightest is 1
-        first = way.poles[0] * (1 / brightest + way.dark) / (1 + way.dark)
-        named = f"{format_metric(first, 'Hz')}, which goes with it, and {format_metric(way.fixed, 'Hz')}"
-        unlike = first, way.dark / (1 / brightest + way.dark), way.fixed
-        details = {"poles": min(first, way.fixed), **dict(zip(UNLIKE_POLES, unlike, strict=True))}
+        black, white = log_eps / brightest + way.dark, (1 + log_eps) / brightest + way.dark
+        first, fixed = way.poles[0], way.fixed
+        named = f"{format_metric(first, 'Hz')}, which goes with it, and {format_metric(fixed, 'Hz')}"
+        unlike = first * white / (1 + way.dark), black / white, fixed
+        details = {"poles": min(first, fixed), **dict(zip(UNLIKE_POLES, unlike, strict=True))}
         said.append((details, "Hz", f"events are of light behind {named}: {alike}"))
     elif way.poles:
         named = " and ".join(format_metric(one, "Hz") for one in way.poles)

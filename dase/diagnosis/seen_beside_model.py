@@ -255,9 +255,9 @@ def _look_at_steps_in_the_dark(
     task: DiagnosisTask, seen: SeenEffects, measurement: Measurement, model: FittedModel
 ) -> SeenEffects:
     """Return what is seen, with by how much farther light goes between two events in the dark, if it does."""
-    if task.evidence.contradiction or seen.lamp or task.given.intersection(MAKERS_OF_DARK_STEPS):
+    if task.evidence.contradiction or seen.lamp or seen.stamped_late:
         return seen
-    if seen.stamped_late:
+    if task.given.intersection(MAKERS_OF_DARK_STEPS):
         return seen
     found = find_larger_steps_in_the_dark(measurement, model.sensor, seed=task.seed)
     return seen if found is None else replace(seen, entries=(*seen.entries, found))

@@ -63,8 +63,8 @@ in 18 of 20 clips of other simulators in which one was seen."""
 
 LATE_STAMPS = 2e-4
 """Time from tick to tick of a clock, or from line to the same line of a scan, above which events are stamped
-late [s]: with one of 1.2 ms (sealed) as many as light went by thresholds fell together, and bright steps
-looked short."""
+late [s]: thresholds that light crosses before a scan of 1.2 ms comes by fall together, and steps look the
+larger the fewer are left (sealed)."""
 
 TICKS_LATE = 1.5
 """Ticks of the clock up to which events that are late may wait for one."""
@@ -111,7 +111,7 @@ class SeenEffects:
 
     @property
     def stamped_late(self) -> bool:
-        """Whether events are stamped by a scan or a slow clock, so that light goes on before they are."""
+        """Whether a scan, a slow clock or packets stamp events, so that light goes on before they do."""
         entry = self.entry_of(TIME_STAMPS)
         waits = () if entry is None else (entry.details.get(name, 0.0) for name in ("step", "period"))
         return max(map(float, waits), default=0.0) > LATE_STAMPS

@@ -125,7 +125,7 @@ class _Steps:
     after: Array
     sign: int
     block: NDArray[np.int64]
-    _levels: dict[int, list[tuple[Array, Array]]] = field(default_factory=dict, repr=False)
+    _levels: dict[int, list[tuple[Array, Array]]] = field(default_factory=dict, init=False, repr=False)
 
     def part(self, group: int, groups: int) -> _Steps:
         """Return those of every so many blocks."""

@@ -85,5 +85,6 @@ def swing_of_light(measurement: Measurement, low: float, high: float, *, log_eps
         return 0.0
     net -= net.mean()
     middle = 0.5 * (times[1:] + times[:-1])
+    # the tone may lie a little above the fastest that frames tell
     tried = np.arange(min(low, high) - resolved, high + 1.1 * resolved, resolved)
     return max(float(abs(net @ np.exp(-2j * np.pi * one * middle))) for one in tried) / whole

@@ -16,6 +16,9 @@ from dase.effects.photocurrent import USUAL, dark_share, idle_beside, relative_p
 from dase.kernels.pixel_stages import EffectStages
 from dase.kernels.vector_math import cosine_and_sine, exponential
 
+FAR_APART = 1000.0
+"""Times as fast as the other that a pole is, at most, of two that are seen."""
+
 
 @wp.func
 def impulse_response(x: float, damping: float):
@@ -267,7 +270,11 @@ class SecondOrder(Effect):
         """
         if observed.unlike_poles:
             first, dark, second = observed.unlike_poles
-            return [cls.of_poles(Bandwidth(cutoff=first, dark=dark), cutoff=second)]
+            least, most = next(p.bounds for p in Bandwidth.parameters() if p.name == "dark")
+            node = Bandwidth(cutoff=first, dark=min(max(dark, least), most))
+            # one that is so much faster is none
+            second = min(max(second, first / FAR_APART), first * FAR_APART)
+            return [cls.of_poles(node, cutoff=second)]
         return [cls(poles="steps", damping=1.0) if observed.clip_step else cls()]
 
     def by_other_laws(self) -> list[Self]:

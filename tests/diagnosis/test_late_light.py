@@ -9,10 +9,12 @@ import pytest
 from helpers.frame_simulator import HEIGHT, WIDTH, shaken_texture
 
 from dase.diagnosis.late_light import find_late_events, unlike_poles_of
+from dase.diagnosis.state import DiagnosisState, DiagnosisTask
 from dase.effects.bandwidth import Bandwidth
 from dase.effects.base import Observations
 from dase.effects.second_order import SecondOrder
 from dase.events import Events
+from dase.fitting.data_split import split_measurement
 from dase.fitting.measurement import Measurement
 from dase.scenes.video import VideoScene
 
@@ -136,6 +138,24 @@ def test_poles_that_are_seen_to_be_unlike_are_tried():
     (tried,) = SecondOrder.candidates(replace(usual, unlike_poles=(80.0, 0.05, 30.0)))
     assert tried == SecondOrder.of_poles(Bandwidth(cutoff=80.0, dark=0.05), cutoff=30.0)
     assert SecondOrder.candidates(usual)[0].poles == "alike"
+
+
+@pytest.mark.parametrize("poles", [(80.0, 0.0, 30.0), (80.0, 3.0, 30.0), (1e5, 0.1, 3.0), (3.0, 0.1, 1e5)])
+def test_poles_beyond_what_the_effect_can_be_are_tried_at_its_ends(poles):
+    usual = Observations(100.0, 0.0, 0.0, "down", 1e5, 0.1, 0.1)
+    (tried,) = SecondOrder.candidates(replace(usual, unlike_poles=poles))
+    assert tried.poles == "apart"
+    assert 1e-4 <= tried.dark <= 1.0
+
+
+def test_poles_that_are_seen_stay_where_all_of_the_time_is_split_anew(scene):
+    evidence = split_measurement(Measurement(late_events(scene), scene), pixels=100)
+    library = {SecondOrder.name: SecondOrder}
+    state = DiagnosisState(DiagnosisTask(evidence, library, 0, lambda *_: None, frozenset()))
+    state.try_unlike_poles((80.0, 0.05, 30.0))
+    state.split_anew(replace(evidence))
+    (tried,) = SecondOrder.candidates(state.task.evidence.observe(idle_bus=0.01))
+    assert tried.poles == "apart"
 
 
 @pytest.mark.slow

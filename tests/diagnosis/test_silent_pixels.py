@@ -71,15 +71,17 @@ def test_silent_pixels_are_the_dead_ones(scene):
     assert str(len(found.pixels)) in found.sentence
 
 
-@pytest.mark.parametrize("shape", ["columns", "patch"])
+@pytest.mark.parametrize("shape", ["columns", "patch", "cross"])
 def test_lines_and_patches_of_dead_pixels_are_found_whole(scene, shape):
     """Their neighbours are dead, too, and those in the middle of a patch have no others."""
     events = dase.simulate(scene, Sensor(), seed=5)
     dead = np.zeros((HEIGHT, WIDTH), np.bool_)
     if shape == "columns":
         dead[:, [20, 41, 42]] = True
-    else:
+    elif shape == "patch":
         dead[30:38, 40:49] = True
+    else:
+        dead[:, [20, 41]] = dead[33] = True
     alive = counts_of(events) > 0
     events = events.select(~dead[events.y, events.x])
     found = find_silent_pixels(Measurement(events, scene), log_eps=1e-3)
@@ -92,6 +94,28 @@ def test_lines_and_patches_of_dead_pixels_are_found_whole(scene, shape):
     grey = np.rint(255 * scene.frames(begins) / scene.frames(begins).max()).astype(np.uint8)
     known = dase.CameraScene(grey, begins)
     assert not find_silent_pixels(Measurement(events, known), log_eps=1e-3).found
+
+
+def test_masked_pixels_of_a_patch_are_not_dead(scene):
+    events = dase.simulate(scene, Sensor(), seed=5)
+    events = events.select(~((abs(events.y - 34.0) <= 4) & (abs(events.x - 44.0) <= 4)))
+
+    def trust(times, pixels):
+        return np.broadcast_to(pixels % WIDTH >= 44, (len(times), len(pixels)))
+
+    found = find_silent_pixels(Measurement(events, scene, trust=trust), log_eps=1e-3)
+    assert found.found
+    assert (found.pixels % WIDTH >= 44).all()
+
+
+@pytest.mark.parametrize("off", [np.s_[:6], np.s_[-5:], np.s_[:, :9], np.s_[20:50, 30:60]])
+def test_what_a_camera_does_not_read_is_not_dead(scene, off):
+    """A margin along a border, and what is wider than any patch of dead pixels."""
+    mask = np.zeros((HEIGHT, WIDTH), np.bool_)
+    mask[off] = True
+    events = dase.simulate(scene, Sensor(), seed=5)
+    found = find_silent_pixels(Measurement(events.select(~mask[events.y, events.x]), scene), log_eps=1e-3)
+    assert not len(found.pixels)
 
 
 @pytest.mark.parametrize("effect", [
