@@ -2,10 +2,9 @@
 
 That is the threshold each time, of the light that the pixel sees when it decides. If events come later by a
 fixed time, or light is behind a pole or two, which may go with it or not, it is so of that light and not of
-the scene's. So the light is
-taken back by a latency, a pole, two poles and both, and the way and the values are sought with which light
-goes equally far. No model is fitted: thresholds may be any, noise and leaks add the same to all, and
-hundreds of thousands of steps tell ways apart that statistics do not.
+the scene's. So the light is taken back by a latency, a pole, two poles and both, and the way and the values
+are sought with which light goes equally far. No model is fitted: thresholds may be any, noise and leaks add
+the same to all, and hundreds of thousands of steps tell ways apart that statistics do not.
 """
 
 from __future__ import annotations
@@ -106,18 +105,18 @@ class Way:
     """A way in which events are late.
 
     Args:
-        differ: What steps of the light then differ by, relative to the threshold.
         delay: Latency [s].
         poles: Of the low-pass, that go with the light, at the brightest, ascending [Hz].
         fixed: Of a pole behind one of these that does not go with the light [Hz]; 0 for none.
         dark: Current without light beside which they go with it, relative to the brightest.
+        differ: What steps of the light then differ by, relative to the threshold; infinite until it is known.
     """
 
-    differ: float
     delay: float = 0.0
     poles: tuple[float, ...] = ()
     fixed: float = 0.0
     dark: float = 0.0
+    differ: float = math.inf
 
     @property
     def kind(self) -> tuple[bool, int]:
@@ -358,9 +357,9 @@ def _way_at(kind: str, logs: Sequence[float], settings: LateLightSettings) -> Wa
     """
     first = math.exp(logs[0])
     if kind == "latency":
-        return Way(math.nan, delay=first)
+        return Way(delay=first)
     dark = min(math.exp(logs[1]), settings.most_dark)
-    one = Way(math.nan, poles=(first,), dark=dark)
+    one = Way(poles=(first,), dark=dark)
     if kind == "late pole":
         return replace(one, delay=math.exp(logs[2]))
     if kind == "fixed pole":

@@ -9,6 +9,7 @@ thresholds need not: so the light itself is asked, which rises and falls that mu
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dase.diagnosis.light_between_events import times_that_are_compared
 from dase.fitting.measurement import Measurement
@@ -21,7 +22,6 @@ SAMPLES = 8_000_000
 SHARE = 0.5
 """Swing of the light, relative to that of the events, from which on a tone is the scene's: 0.6 to 1.4 in four
 clips of two pans, 0.01 at most of the lamps of six clips (development)."""
-
 
 SHARE_AT_HALF = 0.1
 """The same at half of the frame rate, as often as a fan shows other blades in turns: what light does between
@@ -38,21 +38,20 @@ def is_tone_of_light(entry: Signature, measurement: Measurement, *, log_eps: flo
     """
     known = entry.details
     low, high = (known.get(f"frequency_{end}", known["frequency"]) for end in ("low", "high"))
-    at_half = low - _resolved(measurement) < _fastest_tone(measurement) < high + _resolved(measurement)
-    share = SHARE_AT_HALF if at_half else SHARE
+    fastest, resolved = _tones_of(times_that_are_compared(measurement))
+    share = SHARE_AT_HALF if low - resolved < fastest < high + resolved else SHARE
     return swing_of_light(measurement, low, high, log_eps=log_eps) >= share * entry.size
 
 
-def _fastest_tone(measurement: Measurement) -> float:
-    """Return half of the rate of the instants at which the light that is compared is known [Hz]."""
-    times = times_that_are_compared(measurement)
-    return 0.5 / float(np.median(np.diff(times))) if len(times) > 1 else 0.0
+def _tones_of(times: NDArray[np.float64]) -> tuple[float, float]:
+    """Return the fastest tone that instants tell, half of their rate, and how well: half a turn in all [Hz].
 
-
-def _resolved(measurement: Measurement) -> float:
-    """Return how well a tone of the light is known, by half a turn over the time that is compared [Hz]."""
-    times = times_that_are_compared(measurement)
-    return 0.5 / float(times[-1] - times[0]) if len(times) > 1 else 0.0
+    Args:
+        times: At which light is known, ascending [s], shape (T,).
+    """
+    if len(times) < 2:
+        return 0.0, 0.0
+    return 0.5 / float(np.median(np.diff(times))), 0.5 / float(times[-1] - times[0])
 
 
 def swing_of_light(measurement: Measurement, low: float, high: float, *, log_eps: float) -> float:
@@ -71,8 +70,7 @@ def swing_of_light(measurement: Measurement, low: float, high: float, *, log_eps
     times, scene = times_that_are_compared(measurement), measurement.scene
     if len(times) < 3:
         return 0.0
-    fastest = _fastest_tone(measurement)
-    resolved = _resolved(measurement)
+    fastest, resolved = _tones_of(times)
     if low > fastest + resolved:
         return 0.0
     high = min(high, fastest)
