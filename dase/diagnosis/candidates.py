@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import TypeVar
@@ -437,9 +438,7 @@ def try_effects(
         v for name in names for v in variants_to_try(evidence, effects[name], idle_bus=settings.idle_bus)
     ]
     order, left = screen_variants(evidence, present, variants, seed=seed, report=report, settings=settings)
-    # two variants of an effect take the place of one
-    names_of_first = list(dict.fromkeys(one.name for one in order))[: settings.finalists]
-    first = [one for one in order if one.name in names_of_first]
+    first = finalists_of(order, settings)
     chosen = [*first, *family_specialists(order, first, worst)]
     report(f"fitting {', '.join(one.name for one in chosen)}", 0.5)
     parts = [(evidence, chosen)]
@@ -549,6 +548,24 @@ def _best_of_each_effect(candidates: Sequence[Candidate]) -> list[Candidate]:
     for one in sorted(candidates, key=lambda one: one.training_loss):
         best.setdefault(one.name, one)
     return [one for one in candidates if best[one.name] is one]
+
+
+def finalists_of(
+    order: Sequence[Candidate], settings: CandidateSettings = DEFAULTS.candidates
+) -> list[Candidate]:
+    """Return the candidates that are fitted to all pixels of the training half.
+
+    Where the best explains most of what is wrong, some pixels do not tell it from those near it.
+
+    Args:
+        order: Candidates in order of their loss on some pixels.
+        settings: How many are fitted.
+    """
+    # two variants of an effect take the place of one
+    names = list(dict.fromkeys(one.name for one in order))[: settings.finalists]
+    least = order[0].screened_loss if order else math.inf
+    limit = settings.near_best * least if least < settings.explains else 0.0
+    return [one for one in order if one.name in names or one.screened_loss <= limit]
 
 
 def family_specialists(

@@ -12,6 +12,13 @@ class CandidateSettings:
     finalists: int = 4
     """Candidates that are fitted to all pixels of the training half."""
 
+    explains: float = 0.5
+    """Loss of the best of them, in units of the present model's, below which those near it are fitted too."""
+
+    near_best: float = 1.3
+    """Their loss, in units of the best's: thresholds that differ from pixel to pixel were sixth of eight
+    within 1.42, with 1.24, and fitted to all pixels left half of what the next best did."""
+
     followed: int = 8
     """Candidates that are followed where screening shows one clearly ahead: the turn of the others comes. Of
     those whose events go through a readout, which takes ten times as long, no more are ever followed."""

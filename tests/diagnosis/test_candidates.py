@@ -11,7 +11,7 @@ from helpers.brief_diagnosis import NO_LIMITS
 
 import dase
 from dase.diagnosis import candidates
-from dase.diagnosis.candidates import Candidate, calibrate_split, screen_and_descend
+from dase.diagnosis.candidates import Candidate, calibrate_split, finalists_of, screen_and_descend
 from dase.diagnosis.explain_effect import moving_bars
 from dase.diagnosis.settings import DEFAULTS
 from dase.effects import EFFECTS
@@ -28,6 +28,22 @@ from perf.experiments.signatures.run import draw_scene
 STEP = 1e-3
 COARSE_LOSS = {"leak": 5.0, "near": 6.0, "far": 100.0}
 """Of each candidate where it is sampled coarsely; only `near` is worth being sampled finely."""
+
+
+@pytest.mark.parametrize(
+    ("least", "fitted"),
+    [
+        (0.2, ["leak", "leak", "dark", "jitter", "shot", "mismatch"]),
+        (0.6, ["leak", "leak", "dark", "jitter", "shot"]),
+    ],
+)
+def test_candidates_near_one_that_explains_most_are_fitted_too(least, fitted):
+    """Four effects are, however many variants; beside one that explains little so are no others near it."""
+    names = ["leak", "leak", "dark", "jitter", "shot", "mismatch", "hot"]
+    losses = least * np.array([1.0, 1.02, 1.1, 1.2, 1.25, 1.29, 1.31])
+    order = [Candidate(name, SimpleNamespace(), 1.0, loss) for name, loss in zip(names, losses, strict=True)]
+    assert [one.name for one in finalists_of(order)] == fitted
+    assert finalists_of([]) == []
 
 
 def test_what_a_coarse_fit_takes_near_the_best_is_fitted_again_from_where_screening_left_it(monkeypatch):

@@ -133,10 +133,13 @@ def test_no_other_effect_silences_single_pixels(scene, effect):
 
 @pytest.mark.parametrize(
     ("silent", "hardly", "dead"),
-    [(3, 0, False), (4, 0, True), (4, 1, False), (12, 10, False), (61, 21, True)],
+    [(3, 0, False), (4, 0, True), (4, 1, False), (12, 10, False), (64, 19, False), (667, 29, True)],
 )
 def test_silent_pixels_are_more_than_those_that_send_hardly_anything_say(silent, hardly, dead):
-    """Four beside one were slow pixels of a dark current, twelve beside ten those of a slow pole."""
+    """Four beside one were slow pixels of a dark current, twelve beside ten those of a slow pole.
+
+    64 beside 19 came of a leak that drove memories past light that rested.
+    """
     assert SilentPixels(np.arange(silent), 5940, hardly=hardly).found == dead
 
 
