@@ -6,7 +6,8 @@ model without it has hundreds, and just above the end there are as many as the m
 that: a low-pass, noise and spread thresholds thin short intervals out over a factor of two and more.
 
 Simulators that know frames alone send once or a few times for each, so a pixel's intervals end at about the
-time from frame to frame, or at a multiple. There the end says nothing.
+time from frame to frame, or at a multiple. There the end says nothing, unless intervals are as frequent right
+above it as farther away: then no frame has made it.
 """
 
 from __future__ import annotations
@@ -69,6 +70,17 @@ class DeadTimeSettings:
 
     frames: float = 1.5
     """Times from frame to frame of a clip, or from tick to tick, below which an end may be made by these."""
+
+    even: float = 1.6
+    """How much more frequent intervals may be in one of the parts above an end than in another for it to be
+    cut off, whatever frames there are: 1.1 to 1.4 above ten dead times of 0.4 to 2 frames in clips of other
+    simulators, 2 and more above 14 ends of other kinds."""
+
+    parts: tuple[float, float, float] = (1.03, 1.1, 1.3)
+    """Where these parts end, relative to the end of the intervals."""
+
+    fewest: int = 100
+    """Intervals in the first of them, at least."""
 
     lost_in_step: int = 300
     """As `lost`, where events come in step with the frames."""
@@ -137,13 +149,15 @@ def find_dead_time(
     made = replace(measurement, events=made).compared_events()
     seen, modelled = (intervals_of(one, pixels) for one in (events, made))
     step = max(structure.step, structure.line * max(events.width, events.height))
-    if isinstance(scene, VideoScene):
-        step = max(step, scene.longest_gap())
-    shortest = settings.frames * step
+    gap = scene.longest_gap() if isinstance(scene, VideoScene) else 0.0
+    doubtful = settings.frames * max(step, gap)
+    shortest = doubtful if frame_step or measurement.held else settings.frames * step
     if lamp:
         lost = max(settings.lost, round(settings.lost_under_lamp * len(modelled)))
         settings = replace(settings, lost=lost, lost_in_step=max(lost, settings.lost_in_step))
-    return end_of_intervals(seen, modelled, shortest=shortest, in_step=frame_step > 0, settings=settings)
+    return end_of_intervals(
+        seen, modelled, shortest=shortest, doubtful=doubtful, in_step=frame_step > 0, settings=settings
+    )
 
 
 def intervals_of(events: Events, pixels: NDArray[np.int64] | None = None) -> Array:
@@ -169,6 +183,7 @@ def end_of_intervals(
     modelled: Array,
     *,
     shortest: float = 0.0,
+    doubtful: float = 0.0,
     in_step: bool = False,
     settings: DeadTimeSettings = DEAD_TIME,
 ) -> Signature | None:
@@ -178,6 +193,7 @@ def end_of_intervals(
         seen: Times between a pixel's events that were measured [s], ascending, shape (N,).
         modelled: Those of the model without a dead time, of the same pixels [s], ascending, shape (M,).
         shortest: Times up to which an end tells nothing [s].
+        doubtful: Times up to which frames may make an end, unless intervals are cut off there [s].
         in_step: Whether events come in step with frames.
         settings: What an end is.
     """
@@ -187,6 +203,8 @@ def end_of_intervals(
     best: tuple[float, float, int, int, int] | None = None
     for end in np.unique(seen[places[places < len(seen)]]):
         if not shortest < end <= settings.longest:
+            continue
+        if end <= doubtful and not is_cut_off(seen, float(end), settings):
             continue
         here, seen_above = (int(n) for n in np.searchsorted(seen, [end, settings.above * end]))
         there, modelled_above = (int(n) for n in np.searchsorted(modelled, [end, settings.above * end]))
@@ -216,6 +234,22 @@ def end_of_intervals(
             "period": end, "low": low, "high": end, "shortest": shortest, "here": here, "without": there
         },
     )  # fmt: skip
+
+
+def is_cut_off(seen: Array, end: float, settings: DeadTimeSettings = DEAD_TIME) -> bool:
+    """Return whether intervals are as frequent right above an end as farther above it.
+
+    Args:
+        seen: Times between a pixel's events [s], ascending, shape (N,).
+        end: One of them [s].
+        settings: How alike is enough.
+    """
+    edges = np.array([1.0, *settings.parts])
+    counts = np.diff(np.searchsorted(seen, edges * end))
+    if counts[0] < settings.fewest:
+        return False
+    frequent = counts / np.diff(edges)
+    return bool(frequent.max() <= settings.even * frequent.min())
 
 
 def add_dead_time(

@@ -262,8 +262,7 @@ def _fit_beyond_the_search(
         model: The last one.
         judgement: Its held-out error.
     """
-    far = judgement.error > task.settings.pruning.lost * judgement.gate
-    wide = None if far or leaves_nothing(judgement) else with_full_range(model)
+    wide = None if leaves_nothing(judgement) else with_full_range(model)
     if wide is None:
         return model, judgement
     task.progress("fitting beyond the search", 0.9, judgement.error)

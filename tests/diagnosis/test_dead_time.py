@@ -103,12 +103,39 @@ def test_some_pixels_tell_as_well(scene):
 def test_an_end_at_frames_or_ticks_says_nothing(scene):
     sensor = Sensor().with_effect(EFFECTS["refractory"](period=6e-3, mode="drop"))
     slow = drifting_texture(gap=5e-3)
-    assert found(slow, dase.simulate(slow, sensor, seed=1), Sensor()) is None
+    assert found(slow, dase.simulate(slow, sensor, seed=1), Sensor(), frame_step=5e-3) is None
     events = dase.simulate(scene, sensor, seed=1)
     assert found(scene, events, Sensor()) is not None
     assert found(scene, events, Sensor(), structure=TimestampStructure(step=5e-3)) is None
     assert found(scene, events, Sensor(), structure=TimestampStructure(line=5e-5)) is not None
     assert found(scene, events, Sensor(), structure=TimestampStructure(line=2e-4)) is None
+
+
+def test_an_end_within_frames_is_told_where_intervals_are_cut_off():
+    """A clip of OpenEB's rules at 600 fps had its dead time of 2.4 ms, 1.5 frames, told by no sign at all."""
+    sensor = Sensor().with_effect(EFFECTS["refractory"](period=6e-3, mode="drop"))
+    slow = drifting_texture(gap=5e-3)
+    entry = found(slow, dase.simulate(slow, sensor, seed=1), Sensor())
+    assert entry is not None
+    assert entry.details["period"] == pytest.approx(6e-3, rel=0.01)
+
+
+@pytest.mark.parametrize(
+    ("above", "doubtful", "told"),
+    [
+        (lambda rng: rng.uniform(5e-3, 8e-3, 5000), 7.5e-3, True),
+        (lambda rng: 5e-3 + 3e-3 * rng.uniform(size=5000) ** 0.5, 7.5e-3, False),  # they thin out
+        (lambda rng: 5e-3 + 3e-3 * rng.uniform(size=5000) ** 0.5, 4.5e-3, True),
+        (lambda rng: np.append(np.full(2500, 5e-3), rng.uniform(5e-3, 8e-3, 2500)), 7.5e-3, False),  # a scan
+        (lambda rng: rng.uniform(5e-3, 8e-3, 500), 7.5e-3, False),  # too few to tell
+    ],
+)
+def test_intervals_are_cut_off_where_they_are_as_frequent_at_once(above, doubtful, told):
+    rng = np.random.default_rng(1)
+    seen = np.sort(above(rng))
+    modelled = np.sort(rng.uniform(0, 8e-3, len(seen) * 8 // 3))
+    entry = end_of_intervals(seen, modelled, doubtful=doubtful)
+    assert (entry is not None) is told
 
 
 def test_a_few_random_events_in_the_dead_time_hide_it_not():
