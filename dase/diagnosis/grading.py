@@ -13,8 +13,9 @@ part, by which nothing was chosen. Each effect has to earn its grade there:
   it can be, beyond all that is plausible: shot noise that is all ON is another effect. So is it with a dead
   time far shorter than the steps in which light is known: a memory that is set a little later looks like it.
   So is it with one shorter than a frame of a clip that holds its frames.
-  A little jitter or mismatch beside a dead time is in doubt, too: a world that looks for crossings at steps
-  of time makes it when a dead time ends, or by how far beyond the threshold a memory is set.
+  A jitter or mismatch of less than 3 % is in doubt, too, and so is a larger one beside a dead time: a world
+  that looks for crossings at steps of time makes it when a dead time ends, or by how far beyond the threshold
+  a memory is set.
 
 - *either* it *or* something unknown, too, where much is left of the error, if half of what is left without
   it at least goes with it.
@@ -135,7 +136,7 @@ def grade_effects(
         doubtful = any(
             is_strained(model, *one)
             or is_between_samples(model, *one, shortest=shortest)
-            or is_small_beside_another(model, *one, lens=task.lens)
+            or is_too_small(model, *one, lens=task.lens)
             or is_below_black(model, *one, grey=settings.black_greys * task.grey_step)
             for one in mine[name].items()
         )
@@ -235,10 +236,8 @@ def is_between_samples(model: FittedModel, name: str, value: Estimate, *, shorte
     return fact is not None and fact.between_samples and value.high < shortest
 
 
-def is_small_beside_another(
-    model: FittedModel, name: str, value: Estimate, *, lens: OpticsBlur | None = None
-) -> bool:
-    """Return whether another way of an effect beside it looks like one as weak as this.
+def is_too_small(model: FittedModel, name: str, value: Estimate, *, lens: OpticsBlur | None = None) -> bool:
+    """Return whether another world, or another way of an effect beside it, looks like one as weak as this.
 
     Args:
         model: Has the parameter.
@@ -250,7 +249,7 @@ def is_small_beside_another(
     if fact is None:
         return False
     sensor = with_lens(model.sensor, lens)
-    return any(
+    return value.value < fact.clear_from or any(
         other in sensor and not sensor[other].is_off() and value.value < least
         for other, least in fact.clear_beside
     )

@@ -18,7 +18,7 @@ from dase.diagnosis.events_at_rest import find_events_at_rest, noise_is_a_patter
 from dase.diagnosis.late_light import find_late_events, time_of_delay, unlike_poles_of
 from dase.diagnosis.light_between_events import LightBetweenEvents
 from dase.diagnosis.redrawn_thresholds import EFFECT as JITTER
-from dase.diagnosis.redrawn_thresholds import find_jitter_beside, is_unlike_fit
+from dase.diagnosis.redrawn_thresholds import REDRAWN, find_jitter_beside, is_unlike_fit
 from dase.diagnosis.seen_effects import SeenEffects
 from dase.diagnosis.state import DiagnosisState, DiagnosisTask, EventsAlone, with_same_freedom
 from dase.diagnosis.steps_in_the_dark import MAKERS as MAKERS_OF_DARK_STEPS
@@ -159,6 +159,8 @@ def settle_jitter(
         judgement: Its held-out error.
     """
     if JITTER not in task.added_to(model) or seen.lamp or task.evidence.frame_step or seen.full_bus:
+        return seen
+    if judgement.error > REDRAWN.sure:
         return seen
     found = find_jitter_beside(measurement, model, judgement, noise=events_alone.noise, seed=task.seed)
     if found is None or is_unlike_fit(found, model.sensor):

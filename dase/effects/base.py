@@ -62,6 +62,7 @@ class Parameter:
             light does between them, where it is a guess: so is what a memory does there.
         farthest: Largest value to which a search goes, or the effect's own if that is larger, where less than
             three times the plausible range does: what is beyond would cost much and tell nothing more.
+        clear_from: Smallest value that is clear by a fit alone: other worlds look like one that is smaller.
         clear_beside: (name, value) pairs of effects beside which a smaller value is in doubt: another way in
             which a world does those looks like it.
         over_pixels: Whether it says how far pixels differ in the contrast at which they send, by chance: what
@@ -81,6 +82,7 @@ class Parameter:
     nearby: float | None = None
     between_samples: bool = False
     farthest: float = math.inf
+    clear_from: float = 0.0
     clear_beside: tuple[tuple[str, float], ...] = ()
     over_pixels: bool = False
 
@@ -104,6 +106,7 @@ def parameter(
     nearby: float | None = None,
     between_samples: bool = False,
     farthest: float = math.inf,
+    clear_from: float = 0.0,
     clear_beside: tuple[tuple[str, float], ...] = (),
     over_pixels: bool = False,
 ) -> Any:
@@ -111,7 +114,7 @@ def parameter(
     facts = dict(
         unit=unit, default=default, off=off, bounds=bounds, plausible=plausible, about=about, starts=starts,
         periodic=periodic, fitted=fitted, nearby=nearby, between_samples=between_samples,
-        farthest=farthest, clear_beside=clear_beside, over_pixels=over_pixels,
+        farthest=farthest, clear_from=clear_from, clear_beside=clear_beside, over_pixels=over_pixels,
     )  # fmt: skip
     return field(default=default, metadata={"parameter": facts})
 

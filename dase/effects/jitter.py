@@ -41,6 +41,8 @@ class Jitter(Effect):
         bounds=(0.0, 1.0),
         plausible=(0.02, 0.5),
         about="standard deviation over events, relative to the threshold of the pixel",
+        # steps of time and of grey make as much of any threshold
+        clear_from=0.03,
         # a world that looks for crossings at steps of time sends the first after a dead time a little late,
         # beyond the threshold by chance; the point spread of a lens is no Gaussian, nor known to a per cent;
         # a low-pass that goes step by step is not quite that of the model

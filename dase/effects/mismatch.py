@@ -63,6 +63,8 @@ class Mismatch(Effect):
         bounds=(0.0, 1.0),
         plausible=(0.02, 0.5),
         about="standard deviation over pixels, relative to the threshold",
+        # steps of time and of grey make as much of any threshold
+        clear_from=0.03,
         # a world that sets its memory at steps of time, beyond the threshold by chance, has such pixels; so
         # has a lens whose point spread is not quite that of the model, or a low-pass that goes step by step
         clear_beside=(

@@ -49,6 +49,15 @@ def test_a_pan_swings_as_often_as_it_goes_by_a_pixel(rng):
     assert not is_tone_of_light(flicker(270.0, swing), seen, log_eps=0.01)
 
 
+def test_at_half_the_rate_of_held_frames_there_is_no_lamp(rng):
+    """What goes on in a pixel of IEBCS from one frame to the next may go on in turns."""
+    seen = pan(rng, 130.0)
+    held = seen_of(seen.scene.held(0.5 * EVERY))
+    for frequency, of_frames in ((200.0, True), (150.0, False)):
+        assert is_tone_of_light(flicker(frequency, 0.5), held, log_eps=0.01) is of_frames
+        assert not is_tone_of_light(flicker(frequency, 0.5), seen, log_eps=0.01)
+
+
 def test_a_tone_is_looked_for_as_far_as_it_is_known(rng):
     """In the time that is compared, of which the events have told it."""
     seen = pan(rng, 130.0)
