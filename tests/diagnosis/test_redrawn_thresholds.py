@@ -156,20 +156,28 @@ def test_behind_a_full_bus_it_is_not_asked(scene, monkeypatch):
     full = Signature(name=FULL_BUS, answer=Answer.FOUND, sentence="full")
     model = SimpleNamespace(sensor=sensor_with(jitter={"spread": 0.1}))
     for entries, asked in (((), True), ((full,), False)):
-        seen = settle_jitter(task, EventsAlone(), SeenEffects(entries), None, model, None)
+        right = SimpleNamespace(error=0.5)
+        seen = settle_jitter(task, EventsAlone(), SeenEffects(entries), None, model, right)
         assert (seen.entry_of(REDRAWN_THRESHOLDS) is told) is asked
 
 
-@pytest.mark.parametrize(("fitted", "certain"), [(0.25, True), (0.16, True), (0.05, False)])
-def test_what_is_far_more_than_the_model_that_fits_has_is_no_jitter(monkeypatch, fitted, certain):
-    """Events that are sent twice a quarter of a millisecond apart looked like a jitter of 29 %."""
+@pytest.mark.parametrize(
+    ("fitted", "error", "certain"),
+    [(0.25, 0.5, True), (0.16, 0.5, True), (0.05, 0.5, False), (0.25, 0.95, True), (0.25, 1.1, False)],
+)
+def test_what_is_far_more_than_the_model_that_fits_has_is_no_jitter(monkeypatch, fitted, error, certain):
+    """Events that are sent twice a quarter of a millisecond apart looked like a jitter of 29 %.
+
+    A circuit without any was said to have one of 8 %, by a model that left 1.08.
+    """
     told = Signature(name=REDRAWN_THRESHOLDS, answer=Answer.FOUND, sentence="drawn anew", size=0.29)
     monkeypatch.setattr(seen_beside_model, "find_jitter_beside", lambda *given, **more: told)
     task = SimpleNamespace(
         added_to=lambda model: ("jitter",), evidence=SimpleNamespace(frame_step=0.0), seed=0
     )
     model = SimpleNamespace(sensor=sensor_with(jitter={"spread": fitted}))
-    seen = settle_jitter(task, EventsAlone(), SeenEffects(()), None, model, None)
+    last = SimpleNamespace(error=error)
+    seen = settle_jitter(task, EventsAlone(), SeenEffects(()), None, model, last)
     assert (seen.entry_of(REDRAWN_THRESHOLDS) is told) is certain
 
 
