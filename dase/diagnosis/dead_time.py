@@ -73,8 +73,8 @@ class DeadTimeSettings:
 
     even: float = 1.6
     """How much more frequent intervals may be in one of the parts above an end than in another for it to be
-    cut off, whatever frames there are: 1.1 to 1.4 above ten dead times of 0.4 to 2 frames in clips of other
-    simulators, 2 and more above 14 ends of other kinds."""
+    cut off, whatever frames there are: 1.0 to 1.5 above seven dead times of 0.4 to 2 frames in clips of other
+    simulators, 2.6 and more above 16 ends of clips without one."""
 
     parts: tuple[float, float, float] = (1.03, 1.1, 1.3)
     """Where these parts end, relative to the end of the intervals."""

@@ -148,7 +148,7 @@ def settle_jitter(
 ) -> SeenEffects:
     """Return what is seen, with thresholds that are drawn anew at each event if the last model needs that.
 
-    Not with far more than its jitter: what looks so is something else.
+    Not with far more than its jitter, nor where much is left: what looks so is something else.
 
     Args:
         task: What the diagnosis is asked.
