@@ -28,11 +28,12 @@ from dase.signatures.clock import ClockCounts
 from dase.signatures.double_events import IntervalCounts, find_double_events
 from dase.signatures.fixed_pattern import HalfCounts, find_fixed_pattern
 from dase.signatures.flicker import find_flicker
-from dase.signatures.frame_coupling import BurstClock, find_frame_coupling
+from dase.signatures.frame_coupling import BurstClock, doubt_faint_bursts, find_frame_coupling
 from dase.signatures.full_bus import find_even_bus, find_full_bus
 from dase.signatures.hot_pixels import CalmCounts, find_hot_pixels
+from dase.signatures.kinds import GROUPING
 from dase.signatures.opposite_pairs import PairCounts, find_opposite_pairs
-from dase.signatures.result import Signatures
+from dase.signatures.result import Signature, Signatures, without_answer
 from dase.signatures.row_grouping import GroupCounts, find_grouping
 from dase.signatures.time_stamps import StampSettings, find_time_stamps
 
@@ -41,6 +42,10 @@ Progress = Callable[[int], object]
 
 COUNT = 9
 """Signatures that are tested, for the correction."""
+
+ROWS_IN_TURN = 1.5e-3
+"""From the first row to the last [s] from which on bursts group rows by themselves: a shutter that goes from
+row to row takes 2 to 6 ms, a bus reads the array within one."""
 
 
 @dataclass(frozen=True)
@@ -114,6 +119,7 @@ class _SecondPass:
         self.pairs = PairCounts(width, height)
         self.halves = HalfCounts(width, height, first.begin, first.end)
         self.groups = GroupCounts(first.count, first.flooding())
+        self.groups_between = GroupCounts(first.count, first.flooding())
         self.intervals = IntervalCounts(width, height)
 
     def push(self, events: Events) -> None:
@@ -121,6 +127,7 @@ class _SecondPass:
         self.groups.push(events)  # the order in which a burst of all pixels is read tells most of all
         if self._bursts is not None:
             events = events.select(~self._bursts.contains(events.t))
+            self.groups_between.push(events)
         self.halves.push(events)
         self.intervals.push(events)
         self.quiet.push(events)
@@ -174,6 +181,18 @@ def _run_first(passes: _Passes, chunk: int, progress: Progress) -> _FirstPass:
     if first is None:
         raise InputError("signatures: there are no events")
     return first
+
+
+def _find_grouping_beside(coupling: Signature, counts: _SecondPass, level: float) -> Signature:
+    """Return whether lines are read together, told between bursts that come from row to row themselves."""
+    grouping = find_grouping(counts.groups, level)
+    if not grouping.found or abs(coupling.details.get("row_delay", 0.0)) < ROWS_IN_TURN:
+        return grouping
+    between = find_grouping(counts.groups_between, level)
+    if between.found:
+        return between
+    reason = "rows of the bursts come one after the other, and between bursts none stand out"
+    return without_answer(GROUPING, reason, p=between.p)
 
 
 def find_signatures(
@@ -245,13 +264,15 @@ def find_signatures(
     tick = max(stamps.details.get(name, 0.0) for name in ("step", "period")) if stamps.found else 0.0
     if tick and "packets" not in stamps.details and not hot.found:
         hot, hot_pixels = look_for_hot(tick=tick)
+    if "faint" in coupling.details and stamps.found:
+        coupling = doubt_faint_bursts(coupling, stamps.details.get("step", 0.0), first.clock)
     entries = (
         coupling,
         flicker,
         hot,
         find_opposite_pairs(second.pairs, hot_pixels, duration, each, lamp=lit),
         find_fixed_pattern(second.halves, hot_pixels, each, first.first_events()),
-        find_grouping(second.groups, each),
+        _find_grouping_beside(coupling, second, each),
         stamps,
         find_double_events(second.intervals, hot_pixels, each, tick),
         even_bus or find_full_bus(first.clock, first.first_events(), each, tick),

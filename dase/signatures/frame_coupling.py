@@ -21,6 +21,7 @@ from scipy.ndimage import maximum_filter1d, median_filter, uniform_filter1d
 from dase.formatting import format_percent, format_seconds
 from dase.signatures.chance import mean_interval
 from dase.signatures.clock import ClockCounts
+from dase.signatures.faint_bursts import FAINT, find_faint_bursts, find_row_delay
 from dase.signatures.kinds import FRAME_COUPLING
 from dase.signatures.result import Answer, Signature, judge_signature, without_answer
 
@@ -41,6 +42,7 @@ class CouplingSettings:
     periods: int = 24  # that lie between most pairs of bursts are tried
     bursts: int = 200  # of these the first tell the period, the others how exactly
     margin: float = 0.003  # [s] left out on both sides of a burst
+    faint_margin: float = 0.0015  # [s] the same, of bursts that hold few events
     most_margin: float = 0.1  # share of the interval, so that short ones keep time between their bursts
     tiles: float = 0.4  # share of the active tiles that take part in a burst of the whole array
     lamp: float = 0.5  # peaks this high relative to the highest, evenly over the frame, belong to a lamp
@@ -305,6 +307,8 @@ def find_frame_coupling(
             break
         found = frames or _search_bursts(clock, high, weighted, s)
         entry = _look_in_step(clock, *found, weighted, level, s) if found else _without_bursts(clock, s)
+        if entry[0].found and not frames:
+            return _with_row_delay(clock, entry[0]), entry[1]
         if entry[0].found:
             return entry
         # what else is met by a lower limit, or where little moves, is not the frames'
@@ -312,7 +316,58 @@ def find_frame_coupling(
         if weighted and entry[0].answer is Answer.CANNOT_SAY:
             break  # three swings of a lamp look like bursts of frames, once a scene no longer hides them
     assert said is not None
-    return said
+    return said if frames else _look_for_faint_bursts(clock, level, s) or said
+
+
+def _look_for_faint_bursts(
+    clock: ClockCounts, level: float, s: CouplingSettings
+) -> tuple[Signature, BurstClock] | None:
+    """Return the bursts of which no single one is seen; None where all of them together show none either."""
+    bursts = find_faint_bursts(clock)
+    if bursts is None or bursts.p >= level or bursts.tiles < FAINT.tiles or bursts.lasts > FAINT.lasts:
+        return None
+    step, interval = clock.settings.step, bursts.interval
+    if abs(interval / FAINT.screen - 1) < FAINT.near_screen or _is_lamp(bursts.mean, bursts.at, step, s):
+        return None
+    mean, low, high = mean_interval(np.log(bursts.rates))
+    count = math.floor((clock.times[-1] - bursts.first) / interval) + 1
+    begins = bursts.first - 0.25 * interval + interval * np.arange(max(count, 1))
+    first, last = sorted((0.0, bursts.delay))
+    spans = [[0.25 * interval + first - s.faint_margin, 0.25 * interval + last + s.faint_margin]]
+    share = max(bursts.excess, 0.0) * len(begins) / max(int(clock.counts.sum()), 1)
+    name = "ON" if bursts.polarity else "OFF"
+    said = f"faint bursts of the whole array every {1e3 * interval:.2f} ms ({name}), "
+    said += f"{math.exp(mean):.3g} times the rate, {format_percent(share)} of the events"
+    if abs(bursts.delay) >= FAINT.apart:
+        after = "after" if bursts.delay > 0 else "before"
+        said += f", the last row {1e3 * abs(bursts.delay):.0f} ms {after} the first"
+    details = {
+        "interval": interval, "phases": {name: 0.25 * interval}, "share": share, "exposure": math.nan,
+        "clock": "bursts", "bursts": spans, "begins": begins.tolist(), "row_delay": bursts.delay,
+        "faint": True,
+    }  # fmt: skip
+    entry = Signature(
+        name=FRAME_COUPLING, answer=Answer.FOUND, p=bursts.p, size=math.exp(mean), low=math.exp(low),
+        high=math.exp(high), unit="times the usual rate", least=1.0, sentence=said, details=details,
+    )  # fmt: skip
+    return entry, BurstClock(begins, interval, np.array(spans))
+
+
+def _with_row_delay(clock: ClockCounts, entry: Signature) -> Signature:
+    """Return bursts that were seen with how much later they come in the last row than in the first."""
+    delay = find_row_delay(clock, entry.details["interval"])
+    return replace(entry, details={**entry.details, "row_delay": delay})
+
+
+def doubt_faint_bursts(entry: Signature, tick: float, clock: ClockCounts) -> Signature:
+    """Return faint bursts as they were found, or no answer where ticks of time stamps [s] may make them.
+
+    Ticks that are about as long as steps of the clock leave out one of some, at even times.
+    """
+    if tick < 0.25 * clock.settings.step:
+        return entry
+    reason = f"stamps are multiples of {format_seconds(tick)}, too coarse for bursts that no single one shows"
+    return without_answer(FRAME_COUPLING, reason)
 
 
 def _without_bursts(clock: ClockCounts, s: CouplingSettings) -> tuple[Signature, None]:

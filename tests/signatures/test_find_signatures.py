@@ -220,6 +220,81 @@ def test_what_repeats_too_often_for_frames_is_not_asked_for_below_the_first_limi
     assert dase.find_signatures(anywhere(rng, times))["frame coupling"].answer is Answer.NOT_SEEN
 
 
+def faint_bursts(rng, every, share, delay):
+    """Of a share of the pixels one ON event in each frame, of the last row `delay` seconds later."""
+    parts = []
+    for begin in np.arange(0.004, 0.99 - abs(delay), every):
+        pixel = rng.choice(8000, int(8000 * share), replace=False)
+        x, y = pixel % 100, pixel // 100
+        t = begin + delay * y / 80 + rng.uniform(0.0, 2e-4, len(pixel))
+        parts.append(dase.Events(np.sort(t), *(a[np.argsort(t)] for a in (x, y, y >= 0)), 100, 80))
+    return Events.concatenate(parts)
+
+
+def over(parts):
+    """Events of several, in order."""
+    both = Events.concatenate(parts)
+    return both.select(np.argsort(both.t, kind="stable"))
+
+
+@pytest.mark.parametrize(("every", "delay"), [(0.0231, 0.0), (0.0161, 0.005), (0.0342, -0.005)])
+def test_bursts_that_no_single_one_shows_are_told_by_all_of_them(rng, every, delay):
+    """One per cent of the pixels, 80 events beside 150: six clips of other simulators were mute or wrong."""
+    usual = anywhere(rng, rng.uniform(0.0, 1.0, 300_000))
+    weak = faint_bursts(rng, every, 0.01, delay)
+    entry = dase.find_signatures(over([usual, weak]))["frame coupling"]
+    assert entry.found
+    assert entry.details["interval"] == pytest.approx(every, rel=3e-3)
+    assert entry.details["row_delay"] == pytest.approx(delay, abs=1.1e-3)
+    assert ("row" in entry.sentence) == bool(delay)
+    clock = BurstClock.of(entry.details)
+    assert clock.contains(weak.t).mean() > 0.95
+    assert entry.details["share"] == pytest.approx(len(weak) / (len(usual) + len(weak)), rel=0.3)
+
+
+def test_bursts_that_go_from_row_to_row_are_no_bus_that_reads_rows(rng):
+    usual, weak = anywhere(rng, rng.uniform(0.0, 1.0, 60_000)), faint_bursts(rng, 0.0161, 0.04, 0.005)
+    looked = dase.find_signatures(over([usual, weak]))
+    assert looked["frame coupling"].details["row_delay"] == pytest.approx(0.005, abs=1.1e-3)
+    assert looked["grouping"].answer is Answer.CANNOT_SAY
+    assert "rows of the bursts come one after the other" in looked["grouping"].sentence
+
+
+def test_faint_bursts_show_beside_frames_of_a_clip(rng):
+    """What comes again each 4 ms is far above them, and is taken out first."""
+    frames = anywhere(rng, np.concatenate([rng.uniform(0.0, 1.0, 150_000), pulses(rng, 0.004, 300, 1e-3)]))
+    entry = dase.find_signatures(over([frames, faint_bursts(rng, 0.0231, 0.02, 0.0)]))["frame coupling"]
+    assert entry.found
+    assert entry.details["interval"] == pytest.approx(0.0231, rel=3e-3)
+    assert not dase.find_signatures(frames)["frame coupling"].found
+
+
+def test_ticks_beat_with_the_clock_and_are_no_bursts(rng):
+    times = 1.4675e-3 * np.floor(rng.uniform(0.0, 1.0, 700_000) / 1.4675e-3)
+    assert not dase.find_signatures(anywhere(rng, times))["frame coupling"].found
+
+
+def test_what_comes_again_in_a_part_of_the_array_is_no_coupling(rng):
+    usual, weak = anywhere(rng, rng.uniform(0.0, 1.0, 300_000)), faint_bursts(rng, 0.0231, 0.03, 0.0)
+    part = weak.select(weak.x < 60)
+    assert dase.find_signatures(over([usual, weak]))["frame coupling"].found
+    assert not dase.find_signatures(over([usual, part]))["frame coupling"].found
+
+
+def test_what_lasts_as_long_as_a_scene_is_no_coupling(rng):
+    """A wheel whose spokes pass all tiles at the same moments was above its usual rate for 4 ms and more."""
+    slow = np.concatenate([rng.uniform(t, t + 6e-3, 400) for t in np.arange(0.004, 0.99, 0.0269)])
+    wheel = over([anywhere(rng, rng.uniform(0.0, 1.0, 300_000)), anywhere(rng, slow)])
+    assert not dase.find_signatures(wheel)["frame coupling"].found
+
+
+def test_faint_bursts_as_often_as_a_screen_shows_pictures_may_be_its_own(rng):
+    usual = anywhere(rng, rng.uniform(0.0, 1.0, 300_000))
+    assert not dase.find_signatures(over([usual, faint_bursts(rng, 1 / 60, 0.01, 0.005)]))[
+        "frame coupling"
+    ].found
+
+
 def test_bursts_above_a_lamp_keep_the_time_of_the_frames(rng):
     """A lamp as high as weak bursts would be looks like one of bursts that come too often for frames."""
     parts = rng.uniform(0.0, 1.0, 300_000), pulses(rng, 0.01, 400), pulses(rng, 0.046, 3000)
