@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from dase.diagnosis.doubles_of_jumps import find_doubles_at_small_jumps
 from dase.diagnosis.frames_at_rest import events_where_frames_rest
+from dase.diagnosis.late_doubles import find_late_doubles
 from dase.diagnosis.led_pixels import follow_the_light
 from dase.diagnosis.tone_of_light import is_tone_of_light
 from dase.effects import EFFECTS, Effect
@@ -482,6 +483,9 @@ def without_the_scene(seen: SeenEffects, measurement: Measurement, sensor: Senso
         # a simulator that is late does not show that it has held a clip
         if is_held(scene) or doubles.answer is Answer.NOT_SEEN:
             seen = _with_doubles(seen, doubles)
+    if isinstance(scene, VideoScene) and seen.entry_of(DOUBLE_EVENTS) is None:
+        late = find_late_doubles(measurement.compared_events(), scene)
+        seen = _with_doubles(seen, late) if late.found else seen
     if isinstance(scene, VideoScene):
         of_light = [
             one for one in seen.entries

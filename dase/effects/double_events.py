@@ -9,7 +9,7 @@ from typing import ClassVar, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from dase.effects.base import Observations, parameter
+from dase.effects.base import Observations, choice, parameter
 from dase.effects.made_signatures import Makes
 from dase.effects.stream import (
     FOREVER,
@@ -31,6 +31,7 @@ class Doubler(Reader):
         shares: Of OFF and of ON events.
         delay: From an event to its double [ns].
         tail: Mean of what may be added to it [ns].
+        opposite: Whether a double has the other polarity.
         random: Random numbers, in the order of the events.
         empty: A stream without events.
     """
@@ -43,10 +44,12 @@ class Doubler(Reader):
         shares: tuple[float, float],
         delay: float,
         tail: float,
+        opposite: bool,
         random: np.random.Generator,
         empty: Events,
     ):
         self._shares, self._delay, self._tail, self._random = np.array(shares), delay, tail, random
+        self._opposite = opposite
         self._waiting, self._at, self._second = empty, np.empty(0, np.int64), np.empty(0, np.int64)
 
     def push(self, events: Events, until: float) -> tuple[Events, float]:
@@ -56,7 +59,10 @@ class Doubler(Reader):
         late = np.minimum(-np.log1p(-more[again]), self.longest) * self._tail + self._delay
         own = to_nanoseconds(events.t)
         doubles = own[again] + np.maximum(np.rint(late), 1).astype(np.int64)
-        joined = Events.concatenate([self._waiting, events, events.select(again)])
+        second_time = events.select(again)
+        if self._opposite:
+            second_time = replace(second_time, p=~second_time.p.astype(np.bool_))
+        joined = Events.concatenate([self._waiting, events, second_time])
         at: NDArray[np.int64] = np.concatenate([self._at, own, doubles])
         # of one time, events go before doubles, however the stream is cut
         second = np.concatenate([self._second, np.zeros(len(own), np.int64), np.ones(len(doubles), np.int64)])
@@ -73,8 +79,9 @@ class DoubleEvents(StreamEffect):
     """Events that are sent twice.
 
     Where the handshake between a pixel and its arbiter is slow, a pixel asks again before it is reset: an
-    event has a double of the same pixel and polarity a microsecond or two later (some ten to some hundred
-    where a simulator makes them; up to 640 are looked for). In two recordings of a
+    event has a double of the same pixel and polarity a microsecond or two later (some ten to some thousand,
+    of either polarity, where a simulator makes them; where a clip's light does not change, those up to 5 ms
+    are looked for). In two recordings of a
     DVS128 2.3 and 3.2 % of the events are such doubles, within 2 us, nearly all of them OFF; in one of a
     DAVIS240B 0.4 %, after 1 to 5 us. They tell nothing of the light, and count in all rates.
 
@@ -108,7 +115,7 @@ class DoubleEvents(StreamEffect):
     delay: float = parameter(
         6e-7,
         unit="s",
-        bounds=(0.0, 1e-3),
+        bounds=(0.0, 1e-2),
         plausible=(1e-7, 2e-5),
         about="from an event to its double, at least",
         fitted=False,  # far below the steps in which statistics see time
@@ -121,11 +128,15 @@ class DoubleEvents(StreamEffect):
         about="mean of what is added to it",
         fitted=False,
     )
+    polarity: str = choice(
+        "same", among=("same", "opposite"), about="of the double, relative to that of its event"
+    )
 
     @classmethod
     def candidates(cls, observed: Observations) -> list[Self]:
         """Return them where they are seen in the events themselves, see the signature of double events."""
-        return [cls(delay=observed.double_gap)] if observed.double_gap else []
+        polarity = "opposite" if observed.double_opposite else "same"
+        return [cls(delay=observed.double_gap, polarity=polarity)] if observed.double_gap else []
 
     def longest_delay(self, lines: int) -> float:
         """Return infinity where there are doubles: they are more events, however soon they come."""
@@ -135,5 +146,5 @@ class DoubleEvents(StreamEffect):
         """Return what doubles the events of one sensor."""
         return Doubler(
             (self.share, self.share * self.on), 1e9 * self.delay, 1e9 * self.tail,
-            random_numbers(seed, self.name), Events.empty(width, height),
+            self.polarity == "opposite", random_numbers(seed, self.name), Events.empty(width, height),
         )  # fmt: skip

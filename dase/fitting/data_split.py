@@ -107,6 +107,7 @@ class SplitMeasurement:
             not, see `frame_step_of`.
         clip_frames: Time from frame to frame of a clip [s], 0 of another scene.
         double_gap: Mean time from an event to its double [s] where pixels are seen to send twice, else 0.
+        double_opposite: Whether the double has the other polarity.
         unlike_poles: Two that events are seen to be behind, see `Observations`; empty where they are not.
     """
 
@@ -126,6 +127,7 @@ class SplitMeasurement:
     frame_step: float = 0.0
     clip_frames: float = 0.0
     double_gap: float = 0.0
+    double_opposite: bool = False
     unlike_poles: tuple[float, ...] = ()
 
     def observe(self, *, idle_bus: float) -> Observations:
@@ -151,6 +153,7 @@ class SplitMeasurement:
             clip_step=self.frame_step,
             clip_frames=self.clip_frames,
             double_gap=self.double_gap,
+            double_opposite=self.double_opposite,
             unlike_poles=self.unlike_poles,
         )
 

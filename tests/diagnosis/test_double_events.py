@@ -41,6 +41,8 @@ def test_double_events_are_tried_only_where_they_are_seen(scene):
     evidence = split_measurement(measurement, pixels=100)
     state = DiagnosisState(DiagnosisTask(evidence, LIBRARY, 0, lambda *_: None, frozenset()))
     assert DoubleEvents.candidates(state.task.evidence.observe(idle_bus=0.01)) == []
-    state.try_doubles(33e-6)
-    state.split_anew(replace(evidence))
-    assert DoubleEvents.candidates(state.task.evidence.observe(idle_bus=0.01)) == [DoubleEvents(delay=33e-6)]
+    for opposite, polarity in ((False, "same"), (True, "opposite")):
+        state.try_doubles(33e-6, opposite)
+        state.split_anew(replace(evidence))
+        tried = DoubleEvents.candidates(state.task.evidence.observe(idle_bus=0.01))
+        assert tried == [DoubleEvents(delay=33e-6, polarity=polarity)]

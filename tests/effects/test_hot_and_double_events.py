@@ -102,6 +102,7 @@ DOUBLES = [
     DoubleEvents(share=0.3, on=0.2, delay=2e-6),
     DoubleEvents(share=0.9, delay=0.0, tail=4e-6),
     DoubleEvents(share=0.05, on=0.0, delay=6e-7, tail=1e-6),
+    DoubleEvents(share=0.2, on=0.5, delay=2.3e-3, polarity="opposite"),
 ]
 
 
@@ -115,7 +116,9 @@ def test_doubles_are_their_twin_however_the_stream_is_cut(rng, effect, tick):
         zip(ns(events), events.x.tolist(), events.y.tolist(), events.p.astype(int).tolist(), strict=True)
     )
     shares = effect.share, effect.share * effect.on
-    want = twin.doubled(rows, shares, 1e9 * effect.delay, 1e9 * effect.tail, draws)
+    want = twin.doubled(
+        rows, shares, 1e9 * effect.delay, 1e9 * effect.tail, draws, effect.polarity == "opposite"
+    )
     assert len(want) > len(events)
     got = zip(ns(whole), whole.x.tolist(), whole.y.tolist(), whole.p.astype(int).tolist(), strict=True)
     assert list(got) == want

@@ -202,7 +202,12 @@ def within_rate(events: list[Event], most: float, period: int, drop: str, draws:
 
 
 def doubled(
-    events: list[Event], shares: tuple[float, float], delay: float, tail: float, draws: np.ndarray
+    events: list[Event],
+    shares: tuple[float, float],
+    delay: float,
+    tail: float,
+    draws: np.ndarray,
+    opposite: bool = False,
 ) -> list[Event]:
     """Return events and the doubles of some.
 
@@ -212,10 +217,12 @@ def doubled(
         delay: From an event to its double [ns].
         tail: Mean of what is added to it [ns].
         draws: Two random numbers for each event, shape (N, 2).
+        opposite: Whether doubles have the other polarity.
     """
     out = [(event[0], 0, n, event) for n, event in enumerate(events)]
     for n, (event, (chance, more)) in enumerate(zip(events, draws, strict=True)):
         if chance < shares[event[3]]:
             later = event[0] + max(round(delay + min(-math.log(1 - more), 20.0) * tail), 1)
-            out.append((later, 1, n, (later, *event[1:])))
+            polarity = 1 - event[3] if opposite else event[3]
+            out.append((later, 1, n, (later, *event[1:3], polarity)))
     return [event for *_, event in sorted(out)]
