@@ -27,6 +27,7 @@ from dase.diagnosis.held_frames import (
     with_frame_as_memory,
     with_longer_dead_time,
 )
+from dase.diagnosis.lamp_in_part import LampInPart, find_lamp_in_part
 from dase.diagnosis.mostly_bursts import bursts_of_all_events, with_bursts_of_all_events
 from dase.diagnosis.seen_beside_model import (
     look_beside_model,
@@ -48,6 +49,7 @@ from dase.diagnosis.steps_in_the_dark import EFFECT_OF_WAY
 from dase.diagnosis.unequal_thresholds import EFFECT as MISMATCH
 from dase.effects import EFFECTS, Effect
 from dase.effects.jitter import Jitter
+from dase.effects.made_signatures import makers_of, told_by
 from dase.effects.optics_blur import OpticsBlur
 from dase.fitting.burst_strength import BurstStrength, put_in_step
 from dase.fitting.data_split import SPLIT
@@ -68,6 +70,7 @@ from dase.scenes.grey_steps import grey_step_of
 from dase.signatures.kinds import (
     DEAD_TIME,
     DOUBLE_EVENTS,
+    FLICKER,
     LARGER_STEPS_IN_THE_DARK,
     OPPOSITE_PAIRS,
     UNEQUAL_THRESHOLDS,
@@ -134,6 +137,16 @@ def diagnose(
     compared = choose_compared(
         measurement, given, effects, pixels=pixels, seed=seed, device=device, settings=settings
     )
+    lamp = _lamp_in_part(compared, effects) if most > 0 else None
+    if lamp is not None and lamp.lights_all():
+        entries = (*compared.seen.entries, lamp.entry)
+        compared = replace(compared, seen=replace(compared.seen, entries=entries))
+    elif lamp is not None:
+        lamps = told_by(lamp.entry, effects)
+        rest = {name: one for name, one in effects.items() if name not in lamps}
+        found = lamp.added_to(again(lamp.rest_of(measurement), sensor=given, effects=rest), effects)
+        found = replace(found, sensor=with_lens(found.sensor, None if measurement.lens else lens))
+        return replace(found, seconds=time.perf_counter() - begin)
     bursts = bursts_of_all_events(compared, effects)
     if bursts is not None:
         found = again(measurement, sensor=given.with_effect(bursts.effect))
@@ -176,6 +189,20 @@ def diagnose(
     else:  # one that was given and is off is no lens that was found
         found = replace(found, sensor=with_lens(found.sensor, lens))
     return measurement.noted(replace(found, seconds=time.perf_counter() - begin))
+
+
+def _lamp_in_part(compared: ComparedMeasurement, effects: Mapping[str, type[Effect]]) -> LampInPart | None:
+    """Return the lamp that lights a part of the array; None where none is seen or can be named.
+
+    Bursts of frames have tones, too, and a lamp over all of the array is seen already.
+    """
+    seen, given = compared.seen, compared.given
+    kinds = makers_of(FLICKER, effects)
+    if not kinds or any(name in given for name in makers_of(FLICKER, {**EFFECTS, **effects})):
+        return None
+    if seen.bursts is not None or seen.entry_of(FLICKER) is not None:
+        return None
+    return find_lamp_in_part(compared.measurement, log_eps=given.log_eps)
 
 
 def _begin_search(

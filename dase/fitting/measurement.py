@@ -95,8 +95,12 @@ class Measurement:
             out = replace(out, span=span)
         if region is not None:
             mask = mask_of_region(region, self.events.width, self.events.height)
-            out = replace(out, trust=_trust_within(mask, out.trust))
+            out = out.within(mask)
         return out
+
+    def within(self, mask: NDArray[np.bool_]) -> Measurement:
+        """Return the same measurement, of which only some pixels are compared, shape (H, W)."""
+        return replace(self, trust=_trust_within(mask, self.trust))
 
     def through_lens_of(self, sensor: Sensor) -> Measurement:
         """Return the measurement with its scene as the lens of a sensor shows it.
