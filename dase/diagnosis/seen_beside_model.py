@@ -106,6 +106,8 @@ def settle_dead_time(
         bare = with_same_freedom(model.sensor.without(REFRACTORY), model, ())
         seen = _look_for_dead_time(task, seen, measurement, bare)
     elif task.added_to(model):  # else it was asked before
+        if REFRACTORY not in model.sensor:  # what the search has dropped since is asked beside its last model
+            seen = replace(seen, entries=tuple(one for one in seen.entries if one.name != DEAD_TIME))
         seen = _look_for_dead_time(task, seen, measurement, model)
         seen, model, judgement = _without_needless_dead_time(task, seen, measurement, model, judgement)
     ended = seen.entry_of(DEAD_TIME)

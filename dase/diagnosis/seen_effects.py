@@ -479,10 +479,9 @@ def without_the_scene(seen: SeenEffects, measurement: Measurement, sensor: Senso
             seen, entries=tuple(one for one in seen.entries if _is_at_rest(one, measurement, scene))
         )
     if is_held(scene) or (isinstance(scene, VideoScene) and seen.entry_of(DOUBLE_EVENTS) is not None):
+        # a simulator that is late does not show that it has held a clip, nor one that holds parts of a frame
         doubles = find_doubles_at_small_jumps(measurement.compared_events(), scene, sensor)
-        # a simulator that is late does not show that it has held a clip
-        if is_held(scene) or doubles.answer is Answer.NOT_SEEN:
-            seen = _with_doubles(seen, doubles)
+        seen = _with_doubles(seen, doubles)
     if isinstance(scene, VideoScene) and seen.entry_of(DOUBLE_EVENTS) is None:
         late = find_late_doubles(measurement.compared_events(), scene)
         seen = _with_doubles(seen, late) if late.found else seen

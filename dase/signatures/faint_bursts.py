@@ -32,13 +32,7 @@ class FaintBurstSettings:
     beat: float = 8.0  # standard errors of what comes again within `shortest`, which is taken out first,
     once: float = 4.0  # and of what does after a single turn: bursts do after two of half their interval
     beats: int = 4  # of its turns on both sides are what is taken out of one
-    before: float = (
-        7.0  # standard errors that bursts are up before it is taken out, for what it left may beat, too,
-    )
-    others: float = 0.65  # and how far above the others: a tenth of the phases may be as high, relative to it
-    empty: float = (
-        0.3  # share of the steps without an event: of more, ticks of time stamps beat with the clock
-    )
+    clear: float = 6.0  # standard errors above nine of ten phases before that: what it left may beat
     periods: int = 6  # of those at which a rate comes again are folded, for each delay
     best: int = 12  # of all these are looked at closely
     fewest_frames: int = 7  # with less not even the same moment in each frame is significant
@@ -302,7 +296,7 @@ def _describe(
     if excess.beat:
         plain, _ = _fold(excess.aligned(delay, with_beat=True)[0], period)
         others = np.sort(plain)[-max(len(plain) // 10, 2)]
-        if plain[at] < max(s.before, others / s.others) or (plain > plain[at]).sum() > 1:
+        if plain[at] < others + s.clear or (plain > plain[at]).sum() > 1:
             return None
     lasts = step * float((mean > 0.5 * mean[at]).sum())
     first = clock.begin + (begin + at) * step  # two steps, of which this one is the second

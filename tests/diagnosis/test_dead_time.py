@@ -279,6 +279,33 @@ def test_a_dead_time_that_was_put_off_is_asked_for_beside_the_last_model(monkeyp
     assert [("refractory" in one, "linlog" in one) for one in asked] == [(False, True)]
 
 
+@pytest.mark.parametrize("ends", [False, True])
+def test_a_dead_time_that_the_search_has_dropped_is_asked_for_beside_the_last_model(monkeypatch, ends):
+    """Behind a low-pass of 33 Hz, which the first model lacked, 72,000 intervals had been too short."""
+    entry = Signature(name=kinds.DEAD_TIME, answer=Answer.FOUND, sentence="seen", details={"period": 2e-3})
+    model = model_of(Sensor().with_effect(EFFECTS["bandwidth"](cutoff=33.0)), None)
+    task = SimpleNamespace(
+        added_to=lambda one: ("bandwidth",), effects=EFFECTS, evidence=SimpleNamespace(frame_step=0.0)
+    )
+    added, asked = [], []
+
+    def look(task, seen, measurement, one):
+        asked.append(one.sensor)
+        assert seen.entry_of(kinds.DEAD_TIME) is None
+        return replace(seen, entries=(*seen.entries, entry)) if ends else seen
+
+    monkeypatch.setattr(seen_beside_model, "_look_for_dead_time", look)
+    monkeypatch.setattr(
+        seen_beside_model, "add_dead_time", lambda task, one, *rest: (added.append(one) or one, None)
+    )
+    seen, _ = seen_beside_model.settle_dead_time(
+        task, EventsAlone(), SeenEffects((entry,)), None, model, judged(0.3)
+    )
+    assert ["bandwidth" in one for one in asked] == [True]
+    assert (seen.entry_of(kinds.DEAD_TIME) is not None) == ends
+    assert len(added) == ends
+
+
 @pytest.mark.parametrize(
     ("frame_step", "also", "kept"),
     [
