@@ -158,13 +158,14 @@ def find_lamp_in_part(
         one for one in _likely_tones(counts, blocks, s)
         if _is_lamp(one, clip_step_of(scene), counts.duration, s)
     ]  # fmt: skip
-    # of a lamp and its overtones the strongest
-    for lamp in sorted(lamps, key=lambda one: -one.swing):
-        place = lamp.place[counts.tile_of_pixel]
-        light = _swing_in_light(measurement, place, lamp.frequency, log_eps=log_eps)
-        if light < s.of_scene * lamp.swing:
-            return LampInPart(_signature_of(lamp, place, counts.duration, s), place)
-    return None
+    if not lamps:
+        return None
+    # of a lamp and its overtones the strongest; if that is the scene's, pixels make the others of it
+    lamp = max(lamps, key=lambda one: one.swing)
+    place = lamp.place[counts.tile_of_pixel]
+    if _swing_in_light(measurement, place, lamp.frequency, log_eps=log_eps) >= s.of_scene * lamp.swing:
+        return None
+    return LampInPart(_signature_of(lamp, place, counts.duration, s), place)
 
 
 @dataclass(frozen=True)

@@ -113,6 +113,8 @@ def settle_dead_time(
     ended = seen.entry_of(DEAD_TIME)
     if ended is not None and REFRACTORY in task.effects and REFRACTORY not in model.sensor:
         model, _ = add_dead_time(task, model, judgement, ended)
+        if REFRACTORY not in model.sensor:  # no model has it: what the last one lacks may end intervals so
+            seen = seen.with_doubt(DEAD_TIME)
     return _without_delays_of_dead_time(task, seen, model), model
 
 

@@ -135,6 +135,14 @@ class SeenEffects:
         entries = (entry for entry in self.entries if KINDS[entry.name].whatever_fits)
         return frozenset(name for entry in entries for name in self.identified_by(entry))
 
+    def with_doubt(self, name: str) -> SeenEffects:
+        """Return what is seen, with what the signature of a name tells either that or something unknown."""
+        entries = (
+            replace(one, details={**one.details, "doubtful": True}) if one.name == name else one
+            for one in self.entries
+        )
+        return replace(self, entries=tuple(entries))
+
     def without_ceiling_of_light(self, sensor: Sensor) -> SeenEffects:
         """Return what is seen without a ceiling of the rate at which the bus that fits has nothing to do.
 
@@ -229,9 +237,10 @@ class SeenEffects:
                 out = self._with_only_maker(entry, out)
             for name in named_here or (entry.name,):
                 others = two_poles.get(name, ())
-                grade = Grade.EITHER if others else Grade.CERTAIN
+                doubtful = bool(entry.details.get("doubtful", False))
+                grade = Grade.EITHER if others or doubtful else Grade.CERTAIN
                 out = [one for one in out if one.effect != name]
-                out.append(Finding(name, grade, others, seen=entry.sentence))
+                out.append(Finding(name, grade, others, doubtful and not others, seen=entry.sentence))
         return out
 
     def _is_in_doubt(self, one: Finding) -> bool:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy import stats
 from scipy.ndimage import distance_transform_cdt, find_objects, label
 
-from dase.diagnosis.model_at_pixels import count_of_model
+from dase.diagnosis.model_at_pixels import count_at_pixels, count_of_model
 from dase.effects.dead import Dead
 from dase.fitting.compared_time import common_grid, times_of_grid
 from dase.fitting.measurement import Measurement
@@ -170,14 +170,16 @@ def find_silent_pixels(
         return SilentPixels(np.zeros(0, np.int64), 0, settings)
     times = times_of_grid(scene, within_span(whole, measurement.span))
     change, mean = _range_and_mean(scene, times, log_eps, settings.times)
-    events = events.select((events.t >= times[0]) & (events.t <= times[-1]))
-    counts = np.bincount(
-        events.y.astype(np.int64) * events.width + events.x, minlength=events.width * events.height
-    ).reshape(events.height, events.width)
+    shape, every = (events.height, events.width), np.arange(events.width * events.height)
+    # one that sends after the end of the scene, as a late one does, is not dead
+    ever = count_at_pixels(events, every).reshape(shape)
+    counts = count_at_pixels(events.select((events.t >= times[0]) & (events.t <= times[-1])), every).reshape(
+        shape
+    )
     inside = (slice(1, -1), slice(1, -1))
     asked, beside_silent = _are_like_neighbours_that_send(counts, change, mean, settings)
     sent = counts[inside]
-    silent = (sent == 0) & (change[inside] >= settings.change)
+    silent = (ever[inside] == 0) & (change[inside] >= settings.change)
     if measurement.trust is not None:
         trusted = _ever_trusted(measurement.trust, scene, times)[inside]
         asked, silent = asked & trusted, silent & trusted

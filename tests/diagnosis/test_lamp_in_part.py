@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import dase
+from dase.diagnosis import lamp_in_part
 from dase.diagnosis.lamp_in_part import find_lamp_in_part
 from dase.effects import EFFECTS
 from dase.effects.flicker import Flicker
@@ -89,6 +90,34 @@ def test_a_tone_of_the_frames_or_of_the_light_is_no_lamp(clip):
     scene = VideoScene(np.where(PLACE, bars, frames_at(times)).astype(np.float32), times)
     passing = Measurement(dase.simulate(scene, PIXELS, seed=5), scene)
     assert find_lamp_in_part(passing, log_eps=0.01) is None
+
+
+def test_where_the_strongest_tone_is_of_the_light_no_other_is_a_lamp(clip, monkeypatch):
+    """What comes by each 30 ms had a tone of 100 Hz in its light, and others in its events alone."""
+    two = Measurement(dase.simulate(_with_second_tone(), PIXELS, seed=5), clip)
+    asked = []
+
+    def swing(measurement, place, frequency, *, log_eps):
+        asked.append(frequency)
+        return 1.0 if len(asked) == 1 else 0.0
+
+    monkeypatch.setattr(lamp_in_part, "_swing_in_light", swing)
+    assert find_lamp_in_part(two, log_eps=0.01) is None
+    assert len(asked) == 1
+    lamp = find_lamp_in_part(two, log_eps=0.01)
+    assert lamp is not None
+    assert lamp.entry.details["frequency"] == asked[0] == asked[1]
+
+
+def _with_second_tone():
+    """Light under a lamp of 90 Hz, and of 140 Hz at another place."""
+    times = np.arange(0.0, 0.99, 1e-3)
+    light = frames_at(times)
+    other = (X - 70) ** 2 + (Y - 20) ** 2 <= 14**2
+    for place, depth, frequency in ((PLACE, 0.7, 90.0), (other, 0.45, 140.0)):
+        wave = 1 + depth * np.sin(2 * np.pi * frequency * times)
+        light = np.where(place, light * wave[:, None, None].astype(np.float32), light)
+    return VideoScene(light, times)
 
 
 def test_a_diagnosis_names_the_lamp_and_fits_the_rest_of_the_array(clip):

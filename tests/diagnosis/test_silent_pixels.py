@@ -160,6 +160,18 @@ def test_silence_at_the_end_of_a_range_is_no_death(scene):
         assert found.limit().strength == pytest.approx(found.needed / found.asked)
 
 
+def test_a_pixel_that_sends_after_the_end_of_the_scene_is_not_dead(scene):
+    """Light had swept some dark pixels last, whose events a latency puts off beyond it."""
+    events = dase.simulate(scene, Sensor().with_effect(EFFECTS["dead"](share=0.02)), seed=5)
+    found = find_silent_pixels(Measurement(events, scene), log_eps=1e-3)
+    late, rest = found.pixels[: len(found.pixels) // 2], found.pixels[len(found.pixels) // 2 :]
+    after = dase.Events(
+        np.full(len(late), 0.51), late % WIDTH, late // WIDTH, np.ones(len(late), bool), WIDTH, HEIGHT
+    )
+    again = find_silent_pixels(Measurement(dase.Events.concatenate([events, after]), scene), log_eps=1e-3)
+    assert sorted(again.pixels) == sorted(rest)
+
+
 def test_what_a_model_silences_too_is_not_dead(scene):
     """Where a model sends nothing either, silence tells nothing."""
     events = dase.simulate(scene, Sensor(), seed=5)
