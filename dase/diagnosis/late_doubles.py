@@ -25,6 +25,7 @@ from dase.probes.stimulus import log_light_of
 from dase.scenes.video import VideoScene
 from dase.signatures.calm_events import row_major_pixels
 from dase.signatures.chance import poisson_interval
+from dase.signatures.double_events import times_of_many
 from dase.signatures.kinds import DOUBLE_EVENTS
 from dase.signatures.result import Answer, Signature, judge_signature
 
@@ -282,7 +283,8 @@ def _judge_window(
     shares = seconds / np.maximum(slow - seconds, 1)
     # of a polarity that would have fewer than ten nothing is asked
     both = bool(np.all(shares.max() * slow >= 10))
-    shared = float(np.mean(_share_their_times(found.t, window.first + 1)))
+    every = np.sort(found.t)
+    shared = float(times_of_many(every, np.searchsorted(every, found.t[window.first + 1])).mean())
     least = s.least_shared if shared > s.shared else s.least
     few = max(float(seconds.min()), 1.0)
     # medians of so few are as uncertain
@@ -317,18 +319,6 @@ def _judge_window(
         },
     )  # fmt: skip
     return judge_signature(entry, level, "")
-
-
-def _share_their_times(t: NDArray[np.float64], asked: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Return which of some events come at times that many pixels share, shape (K,)."""
-    every, own = np.sort(t), t[asked]
-
-    def others(reach: float) -> NDArray[np.int64]:
-        out: NDArray[np.int64] = np.searchsorted(every, own + reach, side="right")
-        return out - np.searchsorted(every, own - reach) - 1
-
-    out: NDArray[np.bool_] = others(1e-8) > 0.01 * others(4e-4)
-    return out
 
 
 def _differ(logs: NDArray[np.float64], some: NDArray[np.bool_]) -> float:

@@ -102,12 +102,12 @@ def settle_dead_time(
     """
     if REFRACTORY in events_alone.put_off:
         # beside what was found instead of it the intervals may end nowhere
-        seen = replace(seen, entries=tuple(one for one in seen.entries if one.name != DEAD_TIME))
+        seen = seen.without(DEAD_TIME)
         bare = with_same_freedom(model.sensor.without(REFRACTORY), model, ())
         seen = _look_for_dead_time(task, seen, measurement, bare)
     elif task.added_to(model):  # else it was asked before
         if REFRACTORY not in model.sensor:  # what the search has dropped since is asked beside its last model
-            seen = replace(seen, entries=tuple(one for one in seen.entries if one.name != DEAD_TIME))
+            seen = seen.without(DEAD_TIME)
         seen = _look_for_dead_time(task, seen, measurement, model)
         seen, model, judgement = _without_needless_dead_time(task, seen, measurement, model, judgement)
     ended = seen.entry_of(DEAD_TIME)
@@ -338,8 +338,7 @@ def _without_needless_dead_time(
     without = task.judge(bare)
     if is_worse(without.error, judgement.error, judgement.gate):
         return seen, model, judgement
-    entries = tuple(one for one in seen.entries if one.name != DEAD_TIME)
-    again = _look_for_dead_time(task, replace(seen, entries=entries), measurement, bare)
+    again = _look_for_dead_time(task, seen.without(DEAD_TIME), measurement, bare)
     if again.entry_of(DEAD_TIME) is not None:
         return seen, model, judgement
     return again, bare, without

@@ -135,6 +135,10 @@ class SeenEffects:
         entries = (entry for entry in self.entries if KINDS[entry.name].whatever_fits)
         return frozenset(name for entry in entries for name in self.identified_by(entry))
 
+    def without(self, name: str) -> SeenEffects:
+        """Return what is seen without the signature of a name."""
+        return replace(self, entries=tuple(one for one in self.entries if one.name != name))
+
     def with_doubt(self, name: str) -> SeenEffects:
         """Return what is seen, with what the signature of a name tells either that or something unknown."""
         entries = (
@@ -519,7 +523,7 @@ def without_the_scene(seen: SeenEffects, measurement: Measurement, sensor: Senso
 
 def _with_doubles(seen: SeenEffects, found: Signature) -> SeenEffects:
     """Return what is seen, with what is `found` of double events in place of what was."""
-    entries = (*(one for one in seen.entries if one.name != DOUBLE_EVENTS), *([found] if found.found else []))
+    entries = (*seen.without(DOUBLE_EVENTS).entries, *([found] if found.found else []))
     absent = tuple(one for one in seen.absent if one.name != DOUBLE_EVENTS or not found.found)
     return replace(seen, entries=entries, absent=absent)
 

@@ -169,13 +169,13 @@ class IntervalCounts:
 
 
 def times_of_many(
-    t: NDArray[np.float64], asked: slice, settings: DoubleSettings | None = None
+    t: NDArray[np.float64], asked: slice | NDArray[np.int64], settings: DoubleSettings | None = None
 ) -> NDArray[np.bool_]:
     """Return at which times so many events come as if all pixels shared a few of them, shape (K,).
 
     Args:
         t: Times of events [s], sorted, shape (N,).
-        asked: K of them.
+        asked: Places of K of them.
         settings: What is a double event.
     """
     s = settings or DoubleSettings()

@@ -110,9 +110,9 @@ class _FirstPass:
 class _SecondPass:
     """What is counted by pixel, free of bursts that come with frames."""
 
-    def __init__(self, first: _FirstPass, bursts: BurstClock | None):
+    def __init__(self, first: _FirstPass, bursts: BurstClock | None, rows_in_turn: bool):
         width, height = first.width, first.height
-        self._bursts = bursts
+        self._bursts, self._rows_in_turn = bursts, rows_in_turn
         self._filter = CalmFilter(width, height)
         self.quiet = CalmShare(width, height, first.begin, self._filter)
         self.calm = CalmCounts(width, height, (first.begin + first.end) / 2)
@@ -127,6 +127,7 @@ class _SecondPass:
         self.groups.push(events)  # the order in which a burst of all pixels is read tells most of all
         if self._bursts is not None:
             events = events.select(~self._bursts.contains(events.t))
+        if self._rows_in_turn:
             self.groups_between.push(events)
         self.halves.push(events)
         self.intervals.push(events)
@@ -183,10 +184,10 @@ def _run_first(passes: _Passes, chunk: int, progress: Progress) -> _FirstPass:
     return first
 
 
-def _find_grouping_beside(coupling: Signature, counts: _SecondPass, level: float) -> Signature:
+def _find_grouping_beside(rows_in_turn: bool, counts: _SecondPass, level: float) -> Signature:
     """Return whether lines are read together, told between bursts that come from row to row themselves."""
     grouping = find_grouping(counts.groups, level)
-    if not grouping.found or abs(coupling.details.get("row_delay", 0.0)) < ROWS_IN_TURN:
+    if not (grouping.found and rows_in_turn):
         return grouping
     between = find_grouping(counts.groups_between, level)
     if between.found:
@@ -249,7 +250,8 @@ def find_signatures(
     flicker, lamp = find_flicker(first.clock, each, bursts, doubtful if coupling.p < 0.01 else 0.0)
     # what the whole array follows confounds in the same way, be it a lamp or bursts that are hardly seen
     lit = lamp is not None or (flicker.p < each and flicker.size >= flicker.least)
-    second = _SecondPass(first, bursts)
+    rows_in_turn = abs(coupling.details.get("row_delay", 0.0)) >= ROWS_IN_TURN
+    second = _SecondPass(first, bursts, rows_in_turn)
     for part in passes.parts(chunk, progress):
         second.push(part)
     second.finish()
@@ -272,7 +274,7 @@ def find_signatures(
         hot,
         find_opposite_pairs(second.pairs, hot_pixels, duration, each, lamp=lit),
         find_fixed_pattern(second.halves, hot_pixels, each, first.first_events()),
-        _find_grouping_beside(coupling, second, each),
+        _find_grouping_beside(rows_in_turn, second, each),
         stamps,
         find_double_events(second.intervals, hot_pixels, each, tick),
         even_bus or find_full_bus(first.clock, first.first_events(), each, tick),
