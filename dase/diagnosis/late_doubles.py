@@ -16,12 +16,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
-from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
 from dase.events import Events
 from dase.fitting.frame_steps import clip_step_of
 from dase.formatting import format_count, format_percent, format_seconds
-from dase.probes.stimulus import log_light_of
+from dase.probes.stimulus import log_light_beside, log_light_of
 from dase.scenes.video import VideoScene
 from dase.signatures.calm_events import row_major_pixels
 from dase.signatures.chance import poisson_interval
@@ -94,8 +93,6 @@ class LateDoubleSettings:
 
 
 LATE_DOUBLES = LateDoubleSettings()
-BLOCK = 4_000_000
-"""Samples of the light that are looked at together, for their memory."""
 
 
 @dataclass(frozen=True)
@@ -172,8 +169,8 @@ def _in_slow_light(
     """Return the events by pixel, and pairs that light does not explain; None where it tells no threshold."""
     pixel = row_major_pixels(events).astype(np.int64)
     order = np.argsort(pixel, kind="stable")
+    level, low, high = (light[order] for light in _light_around(events.t, pixel, scene, step, s))
     t, on, pixel = events.t[order], events.p[order].astype(bool), pixel[order]
-    level, low, high = _light_around(t, pixel, scene, step, s)
     times = scene.sample_times()
     lit = (low > math.log(s.dark)) & (t > times[0]) & (t < times[-1])
     same = (pixel[1:] == pixel[:-1]) & lit[1:] & lit[:-1]
@@ -205,8 +202,8 @@ def _light_around(
     Relative to the brightest hundredth of the pixels.
 
     Args:
-        t: Times of events, one pixel after the other [s], shape (N,).
-        pixel: Row-major, ascending.
+        t: Times of events, ascending [s], shape (N,).
+        pixel: Of each, row-major, shape (N,).
         scene: A clip.
         step: From frame to frame [s].
         s: How many frames are looked at.
@@ -219,28 +216,11 @@ def _light_around(
     around = s.frames * max(1, round(step / float(np.median(np.diff(times)))))
     at = np.clip(np.searchsorted(times, t, side="right") - 1, 0, len(times) - 2)
     part = np.clip((t - times[at]) / (times[at + 1] - times[at]), 0.0, 1.0).astype(np.float32)
-    level, low, high = (np.empty(len(t), np.float32) for _ in range(3))
-    for pixels, rows in _blocks_of(pixel, number, len(times)):
-        light = log_light_of(scene, times, pixels, log_eps=s.floor * top) - np.float32(math.log(top))
-        column, here = pixel[rows] - pixels[0], at[rows]
-        before = light[here, column]
-        level[rows] = before + (light[here + 1, column] - before) * part[rows]
-        # from `around` - 1 samples before that of an event to `around` behind it
-        low[rows] = minimum_filter1d(light, 2 * around, axis=0, origin=-1)[here, column]
-        high[rows] = maximum_filter1d(light, 2 * around, axis=0, origin=-1)[here, column]
-    return level, low, high
-
-
-def _blocks_of(
-    pixel: NDArray[np.int64], number: int, instants: int
-) -> Iterator[tuple[NDArray[np.int32], slice]]:
-    """Yield pixels that are looked at together, and the rows of their events."""
-    size = max(1, BLOCK // instants)
-    for first in range(0, number, size):
-        last = min(first + size, number)
-        begin, end = np.searchsorted(pixel, (first, last))
-        if end > begin:
-            yield np.arange(first, last, dtype=np.int32), slice(int(begin), int(end))
+    pixels = np.arange(number, dtype=np.int32)
+    light = log_light_beside(scene, times, pixels, at, pixel, log_eps=s.floor * top, reach=around)
+    light -= np.float32(math.log(top))
+    before = light[around - 1]
+    return before + (light[around] - before) * part, light.min(0), light.max(0)
 
 
 def _likely_windows(found: _InSlowLight, s: LateDoubleSettings) -> Iterator[_Window]:

@@ -161,7 +161,7 @@ class _Steps:
         events = events.select((events.y >= first) & (events.y < after))
         pixel = (events.y.astype(np.int64) - first) * events.width + events.x
         order = np.lexsort((events.t, pixel))
-        level = np.ascontiguousarray(light.level.T, np.float32)
+        level = np.ascontiguousarray(light.level().T, np.float32)
         brightest = float(np.quantile(level, 0.99))
         on = np.asarray(events.p, bool)[order]
         return cls(level, light.times, pixel[order], events.t[order], on, brightest, settings, device)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from dase.events import Events
 from dase.fitting.held_events import rows_with_most_events
 from dase.fitting.measurement import Measurement
-from dase.probes.stimulus import log_light_of
+from dase.probes.stimulus import log_light_beside, log_light_of
 from dase.scenes.between_frames import CameraScene
 from dase.simulation.sensor import Sensor
 from dase.simulation.simulate import simulate
@@ -118,11 +118,10 @@ class LightBetweenEvents:
         """Rows that are looked at, and columns."""
         return self.rows[1] - self.rows[0], self.measurement.scene.width
 
-    @cached_property
-    def level(self) -> NDArray[np.float32]:
-        """Log intensity of the pixels of the rows, shape (T, P)."""
+    def level(self, every: int = 1) -> NDArray[np.float32]:
+        """Return the log intensity of the pixels of the rows, of every so many instants, shape (T, P)."""
         return log_light_of(
-            self.measurement.scene, self.times, self._pixels.astype(np.int32), log_eps=self.log_eps
+            self.measurement.scene, self.times[::every], self._pixels.astype(np.int32), log_eps=self.log_eps
         )
 
     @cached_property
@@ -152,9 +151,10 @@ class LightBetweenEvents:
         first, after = self.rows
         events = events.select((events.y >= first) & (events.y < after))
         pixel = (events.y.astype(np.int64) - first) * events.width + events.x
+        level, speed = self._level_and_speed(pixel, events.t)
         order = np.lexsort((events.x, events.y))
         pixel, t, p = pixel[order], events.t[order], np.asarray(events.p, bool)[order]
-        level, speed = self._level_and_speed(pixel, t)
+        level, speed = level[order], speed[order]
         darkest = np.quantile(level, 0.99) + math.log(self.settings.darkest) if len(level) else 0.0
         gap = np.diff(t)
         counts = (pixel[1:] == pixel[:-1]) & (gap > 0) & (np.minimum(level[1:], level[:-1]) > darkest)
@@ -173,14 +173,16 @@ class LightBetweenEvents:
 
         Args:
             pixel: Of each event, row-major within the rows, shape (N,).
-            t: Time of each [s], shape (N,).
+            t: Time of each, ascending [s], shape (N,).
         """
         times = self.times
         at = np.clip(np.searchsorted(times, t, side="right") - 1, 0, len(times) - 2)
         gap = times[at + 1] - times[at]
         share = np.clip((t - times[at]) / gap, 0.0, 1.0)
-        here = self.level[at, pixel]
-        step = self.level[at + 1, pixel] - here
+        here, there = log_light_beside(
+            self.measurement.scene, times, self._pixels.astype(np.int32), at, pixel, log_eps=self.log_eps
+        )
+        step = there - here
         return here + step * share, step / gap
 
 

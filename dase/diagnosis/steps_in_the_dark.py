@@ -213,7 +213,7 @@ def find_larger_steps_in_the_dark(
     light = LightBetweenEvents.of(measurement, log_eps=sensor.log_eps, settings=LOOKED_AT)
     if light is None:
         return None
-    brightest = float(np.quantile(light.level[:: max(1, len(light.level) // 50)], 0.99))
+    brightest = float(np.quantile(light.level(every=max(1, len(light.times) // 50)), 0.99))
     width = measurement.scene.width
     seen = _steps_of(light.seen, brightest, width, settings)
     law, differ = _law_of(seen, settings), _differ(seen, None, settings)

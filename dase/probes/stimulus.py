@@ -296,6 +296,53 @@ def log_light_of(
     return out
 
 
+def log_light_beside(
+    scene: Scene,
+    times: NDArray[np.float64],
+    pixels: NDArray[np.int32],
+    at: NDArray[np.int64],
+    which: NDArray[np.int64],
+    *,
+    log_eps: float,
+    reach: int = 1,
+    at_once: int = 256,
+) -> NDArray[np.float32]:
+    """Return the log intensity of single pixels at the instants about some, shape (2 * reach, N).
+
+    From `reach` - 1 before the instant of each to `reach` behind it; what lies beyond the first or the last
+    instant is that one.
+
+    Args:
+        scene: What they see.
+        times: Increasing [s], shape (T,).
+        pixels: Row-major indices, shape (P,).
+        at: Which of the times, ascending, shape (N,).
+        which: Of the pixels, shape (N,).
+        log_eps: Added to intensities before the logarithm.
+        reach: Instants on either side.
+        at_once: Frames that are rendered together, for their memory.
+    """
+    eps, count = np.float32(log_eps), len(times)
+    out = np.empty((2 * reach, len(at)), np.float32)
+    # one instant after the other: of all light only what is asked for is looked up, and stays near
+    firsts = np.arange(0, count, at_once)
+    ends = np.searchsorted(at, np.append(firsts, count))
+    for first, begin, end in zip(firsts.tolist(), ends[:-1].tolist(), ends[1:].tolist(), strict=True):
+        if begin == end:
+            continue
+        low, high = max(first - reach + 1, 0), min(first + at_once + reach, count)
+        values, light = _values_of(scene, times[low:high], pixels)
+        flat, log_of_level = values.reshape(-1), None if light is None else np.log(light + eps)
+        for n, part in enumerate(out[:, begin:end]):
+            instant = np.clip(at[begin:end] + (n + 1 - reach), 0, count - 1) - low
+            found = flat[instant * len(pixels) + which[begin:end]]
+            if log_of_level is None:
+                np.log(np.add(found, eps, out=part), out=part)
+            else:
+                np.take(log_of_level, found, out=part)
+    return out
+
+
 def _values_of(
     scene: Scene, times: NDArray[np.float64], pixels: NDArray[np.int32]
 ) -> tuple[NDArray[Any], NDArray[np.float32] | None]:

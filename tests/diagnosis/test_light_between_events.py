@@ -76,6 +76,6 @@ def test_light_that_is_known_in_part_or_sends_nothing_tells_nothing():
     events = Events(np.array([0.1, 0.9]), np.array([1, 1]), np.array([0, 1]), np.ones(2, bool), 3, 2)
     light = LightBetweenEvents.of(Measurement(events, scene), log_eps=0.0)
     assert light.rows == (0, 2)
-    np.testing.assert_allclose(light.level, light.times[:, None] * np.arange(6) - 5, atol=1e-5)
+    np.testing.assert_allclose(light.level(), light.times[:, None] * np.arange(6) - 5, atol=1e-5)
     assert LightBetweenEvents.of(Measurement(Events.empty(3, 2), scene), log_eps=0.0) is None
     assert LightBetweenEvents.of(Measurement(events, scene).part(0.1, 0.3), log_eps=0.0) is None

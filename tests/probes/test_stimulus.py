@@ -10,7 +10,16 @@ import pytest
 import dase
 from dase.fitting.data_split import split_measurement
 from dase.fitting.measurement import Measurement
-from dase.probes.stimulus import STIMULUS, Grid, Stimulus, band_edges, light_of, sort_into_cells
+from dase.probes.stimulus import (
+    STIMULUS,
+    Grid,
+    Stimulus,
+    band_edges,
+    light_of,
+    log_light_beside,
+    log_light_of,
+    sort_into_cells,
+)
 
 
 @pytest.fixture
@@ -86,3 +95,21 @@ def test_memory_of_a_long_rest_is_that_of_its_cells_and_levels():
     assert peak < 4 * stored
     light = light_of(scene, np.array([0.0]), evidence.train.trials.stimulus.pixels)
     np.testing.assert_array_equal(evidence.train.trials.stimulus.intensity[:, :1], light)
+
+
+@pytest.mark.parametrize("kind", ["levels", "numbers", "rendered"])
+def test_light_beside_instants_is_that_of_all_light(rng, kind):
+    times = np.arange(40) * 1e-3
+    levels = rng.integers(0, 256, (40, 9, 12), dtype=np.uint8)
+    if kind == "rendered":
+        picture = dase.Picture(rng.random((12, 16)).astype(np.float32))
+        layer = dase.Layer(picture, dase.Motion(x=(-0.3, 0.3)))
+        scene = dase.LayerScene([layer], width=12, height=9, duration=0.04)
+    else:
+        scene = dase.VideoScene(levels if kind == "levels" else levels / np.float32(255), times)
+    pixels = np.arange(24, 72, dtype=np.int32)
+    at, which = np.sort(rng.integers(0, 40, 500)), rng.integers(0, len(pixels), 500)
+    level = log_light_of(scene, times, pixels, log_eps=0.01)
+    found = log_light_beside(scene, times, pixels, at, which, log_eps=0.01, reach=3, at_once=7)
+    expected = [level[np.clip(at + n, 0, 39), which] for n in range(-2, 4)]
+    np.testing.assert_array_equal(found, expected)
