@@ -32,6 +32,7 @@ from dase.diagnosis.mostly_bursts import bursts_of_all_events, with_bursts_of_al
 from dase.diagnosis.seen_beside_model import (
     look_beside_model,
     settle_dead_time,
+    settle_doubles,
     settle_jitter,
     settle_leak,
 )
@@ -160,7 +161,8 @@ def diagnose(
     if shown is not None:
         return replace(again(shown), seconds=time.perf_counter() - begin)
     part = part_to_simulate(measurement, state.task.evidence.when)
-    seen = without_the_scene(compared.seen, part, start.sensor, seed)
+    in_step = state.task.evidence.frame_step > 0
+    seen = without_the_scene(compared.seen, part, start.sensor, seed, in_step=in_step)
     doubles = seen.entry_of(DOUBLE_EVENTS)
     if doubles is not None:
         state.try_doubles(doubles.details["gap"], doubles.details.get("opposite", False))
@@ -181,6 +183,7 @@ def diagnose(
         return replace(again(state.other_scene), seconds=time.perf_counter() - begin)
     seen, model = settle_dead_time(state.task, state.events_alone, seen, measurement, model, judgement)
     seen = settle_jitter(state.task, state.events_alone, seen, measurement, model, judgement)
+    seen = settle_doubles(state.task, seen, model)
     seen = settle_leak(state.task, seen, measurement, model)
     found = conclude_diagnosis(state, start, model, before, seen, names, measurement)
     found = _with_what_pixels_show(found, state.task, compared, seen, model, strength)

@@ -225,6 +225,8 @@ def _effects_of(
         sentence = f"events of the same frame and the same way to go come {format_seconds(jitter)} apart"
         mine = {"timestamp.jitter": Estimate(jitter, jitter - half, jitter + half)}
         out.append((Timestamp(jitter=jitter, step=0.0), sentence, mine))
+    if delays.come_in_parts():
+        return out  # the way says in which part of a frame an event comes, however fast a pixel is
     cutoff = 1 / (2 * math.pi * max(slope, 1e-9))
     if cutoff <= settings.cutoff and delays.slope_in_errors() >= settings.errors:
         ends = [1 / (2 * math.pi * (slope + sign * float(errors[1]))) for sign in (1, -1)]

@@ -27,10 +27,12 @@ from dase.effects.second_order import SecondOrder
 from dase.fitting.data_split import SplitMeasurement
 from dase.fitting.frame_steps import clip_step_of
 from dase.fitting.held_clips import begin_of_events
+from dase.fitting.held_events import HeldEvents
 from dase.fitting.measurement import Measurement, note_of_held_frames
 from dase.fitting.model import FittedModel, fit_present_model, refit_model, refit_work
 from dase.fitting.parameter_space import axes_of
 from dase.fitting.scheduler import run_side_by_side
+from dase.fitting.thresholds_of_frames import thresholds_of_frames
 from dase.formatting import format_seconds
 from dase.probes.random_streams import SimulationStream
 from dase.probes.stimulus import STIMULUS
@@ -65,6 +67,12 @@ class HeldFrameSettings:
 
     longest: int = 1000
     """Frames up to which is counted."""
+
+    few: int = 1_500_000
+    """Intensities, pixels times frames, that tell which frame's light is the memory, about."""
+
+    alike: float = 0.5
+    """What thresholds differ by with that frame's light, relative to its neighbours', where it is clear."""
 
     repeats: int = 12
     """Simulations that judge."""
@@ -102,9 +110,41 @@ def fewest_frames(measurement: Measurement, settings: HeldFrameSettings = HELD_F
     if first + 1 < len(counts) and counts[first] < settings.clear * counts[first + 1]:
         out.append(first + 1)
     if first > 1:
-        out.append(1)  # where light is slow no pixel asks for more, and the frames between say nothing
+        memory, is_clear = _frames_to_memory(measurement, first, settings)
+        # where light is slow no pixel asks for more, and the frames between say nothing; late by a frame and
+        # more, an event is not of the frame that it comes after
+        out = list(dict.fromkeys((first, memory) if is_clear else (*out, memory, 1)))
     _, are_spread = begin_of_events(_phases(measurement))
     return (*out, 0) if are_spread else tuple(out)
+
+
+def _frames_to_memory(measurement: Measurement, most: int, settings: HeldFrameSettings) -> tuple[int, bool]:
+    """Return after how many frames a pixel takes the light for its memory, and whether that is clear.
+
+    With the light of another frame for the memory, the change that made an event seems to be more, or less:
+    thresholds seem to differ. Where light is slow pixels send far later than they can.
+
+    Args:
+        measurement: The light and the events.
+        most: Frames after which pixels send again.
+        settings: How much is looked at.
+    """
+    scene = measurement.scene
+    assert isinstance(scene, VideoScene)
+    seen = HeldEvents.of(measurement.compared_events(), scene, most=settings.few)
+    differ = list[float]()
+    for wait in range(most, 0, -1):
+        spreads = [one.spread for one in thresholds_of_frames(seen, wait=wait).values()]
+        if not spreads:
+            break
+        differ.append(float(np.mean(spreads)))
+        if differ[-1] > min(differ):
+            break
+    if len(differ) < 2:
+        return most, False
+    best = int(np.argmin(differ))
+    beside = [differ[at] for at in (best - 1, best + 1) if 0 <= at < len(differ)]
+    return most - best, differ[best] < settings.alike * min(beside)
 
 
 def with_frame_as_memory(

@@ -477,7 +477,9 @@ def slowest_image(entry: Signature, step: float) -> Signature:
     return replace(entry, sentence=said, details={**entry.details, **details})
 
 
-def without_the_scene(seen: SeenEffects, measurement: Measurement, sensor: Sensor, seed: int) -> SeenEffects:
+def without_the_scene(
+    seen: SeenEffects, measurement: Measurement, sensor: Sensor, seed: int, *, in_step: bool = False
+) -> SeenEffects:
     """Return what is seen and not of the scene: a sensor that has no such effect would show that, too.
 
     Args:
@@ -485,6 +487,7 @@ def without_the_scene(seen: SeenEffects, measurement: Measurement, sensor: Senso
         measurement: Its scene is simulated.
         sensor: The model before the search.
         seed: Of its random numbers.
+        in_step: Whether events come in step with the frames of a clip.
     """
     scene = measurement.scene
     if isinstance(scene, CameraScene):
@@ -501,7 +504,8 @@ def without_the_scene(seen: SeenEffects, measurement: Measurement, sensor: Senso
     if isinstance(scene, VideoScene):
         of_light = [
             one for one in seen.entries
-            if one.name == FLICKER and is_tone_of_light(one, measurement, log_eps=sensor.log_eps)
+            if one.name == FLICKER
+            and is_tone_of_light(one, measurement, log_eps=sensor.log_eps, in_step=in_step)
         ]  # fmt: skip
         seen = replace(seen, entries=tuple(one for one in seen.entries if one not in of_light))
     asked = _asked_of_scene(seen.entries, scene)

@@ -28,16 +28,20 @@ SHARE_AT_HALF = 0.1
 two frames is a guess, and makes most of such a tone (0.19 in a fan's clip, development)."""
 
 
-def is_tone_of_light(entry: Signature, measurement: Measurement, *, log_eps: float) -> bool:
+def is_tone_of_light(
+    entry: Signature, measurement: Measurement, *, log_eps: float, in_step: bool = False
+) -> bool:
     """Return whether the light of a clip swings at a frequency about as much as its events do.
 
-    At half the rate of frames that a simulator holds there is no lamp: a clip of IEBCS with nothing hidden
-    has such a tone, of which its light has less than a hundredth.
+    At half the rate of frames that a simulator holds, or in step with which it sends, there is no lamp: a
+    clip of IEBCS with nothing hidden has such a tone, of which its light has less than a hundredth, and so
+    has one of frame differences.
 
     Args:
         entry: Flicker that is seen in the events.
         measurement: Its scene is a clip.
         log_eps: Added to intensities before the logarithm.
+        in_step: Whether events come in step with the frames.
     """
     known = entry.details
     low, high = (known.get(f"frequency_{end}", known["frequency"]) for end in ("low", "high"))
@@ -45,7 +49,7 @@ def is_tone_of_light(entry: Signature, measurement: Measurement, *, log_eps: flo
     if measurement.held:  # several instants are of one frame
         fastest = 0.5 / measurement.held
     at_half = low - resolved < fastest < high + resolved
-    if at_half and measurement.held:
+    if at_half and (measurement.held or in_step):
         return True  # what goes on in a pixel from one frame to the next may go on in turns
     share = SHARE_AT_HALF if at_half else SHARE
     return swing_of_light(measurement, low, high, log_eps=log_eps) >= share * entry.size

@@ -42,15 +42,16 @@ class HeldEvents:
     frame: NDArray[np.int64]
 
     @classmethod
-    def of(cls, events: Events, scene: VideoScene) -> HeldEvents:
+    def of(cls, events: Events, scene: VideoScene, *, most: int = MOST) -> HeldEvents:
         """Return the events of the rows with the most of them, as many as are looked at.
 
         Args:
             events: In order of time.
             scene: A clip, held or as its frames are written down.
+            most: Intensities that are looked at, pixels times frames.
         """
         times = scene.frame_times()
-        first, after = rows_with_most_events(events, MOST // (len(times) * scene.width))
+        first, after = rows_with_most_events(events, most // (len(times) * scene.width))
         frame = np.searchsorted(times, events.t + 1e-9, side="right") - 1
         inside = (events.y >= first) & (events.y < after) & (frame >= 0) & (frame < len(times) - 1)
         events, frame = events.select(inside), frame[inside]

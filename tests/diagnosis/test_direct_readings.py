@@ -143,3 +143,20 @@ def test_single_events_in_the_middle_of_their_frames_are_not_late(late, apart, n
         level=np.zeros(count), gap=2e-3, group=np.arange(count) % 8, square=rng.uniform(0, 1, count),
     )  # fmt: skip
     assert [effect.name for effect, _, _ in _effects_of(delays, READINGS)] == names
+
+
+@pytest.mark.parametrize("parts", [1, 3, 5])
+def test_light_that_goes_on_in_parts_of_a_frame_shows_no_low_pass(parts):
+    """What has further to go is sent in a later part, as a slow pixel would."""
+    rng, count = np.random.default_rng(0), 8000
+    part = rng.uniform(0.02, 0.95, count)
+    way = -np.log(1 - part)
+    late = np.floor(part * parts) / parts * 2e-3 + 2e-4 if parts > 1 else 2e-4 * (1 + way)
+    delays = DelaysAfterFrames(
+        way=way, late=late + 5e-6 * rng.standard_normal(count), level=np.zeros(count), gap=2e-3,
+        group=np.arange(count) % 8, square=rng.uniform(0, 1, count),
+    )  # fmt: skip
+    assert delays.slope_in_errors() > READINGS.errors
+    assert delays.come_in_parts() == (parts > 1)
+    names = [effect.name for effect, _, _ in _effects_of(delays, READINGS)]
+    assert ("bandwidth" in names) == (parts == 1)

@@ -70,6 +70,17 @@ def test_a_dead_time_of_several_frames_is_certain(scene):
     assert len(found.errors) == 2
 
 
+@pytest.mark.parametrize(
+    ("dead", "threshold", "frames"),
+    [(0.0, 0.2, (3, 1)), (5e-3, 0.2, (8, 6)), (5e-3, 0.3, (9, 6)), (8.6e-3, 0.2, (11, 9))],
+)
+def test_thresholds_tell_which_frame_is_the_memory_where_light_is_slow(dead, threshold, frames):
+    """No pixel sends at the first frame that it could: it had waited for 3 to 13 in place of 1 to 9."""
+    slow = shaken_texture(gap=1e-3, length=0.4)
+    events = held_with_low_pass(slow, dead=dead, threshold=threshold)
+    assert fewest_frames(as_measurement(events, slow)) == frames
+
+
 @pytest.mark.slow
 def test_what_waits_for_late_events_has_no_dead_time(scene):
     events = held_with_low_pass(scene, late=6.3e-3)

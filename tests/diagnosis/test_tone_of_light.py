@@ -49,12 +49,13 @@ def test_a_pan_swings_as_often_as_it_goes_by_a_pixel(rng):
     assert not is_tone_of_light(flicker(270.0, swing), seen, log_eps=0.01)
 
 
-def test_at_half_the_rate_of_held_frames_there_is_no_lamp(rng):
-    """What goes on in a pixel of IEBCS from one frame to the next may go on in turns."""
+def test_at_half_the_rate_of_frames_of_a_simulator_there_is_no_lamp(rng):
+    """What goes on in a pixel from one frame to the next, held or differenced, may go on in turns."""
     seen = pan(rng, 130.0)
     held = seen_of(seen.scene.held(0.5 * EVERY))
     for frequency, of_frames in ((200.0, True), (150.0, False)):
         assert is_tone_of_light(flicker(frequency, 0.5), held, log_eps=0.01) is of_frames
+        assert is_tone_of_light(flicker(frequency, 0.5), seen, log_eps=0.01, in_step=True) is of_frames
         assert not is_tone_of_light(flicker(frequency, 0.5), seen, log_eps=0.01)
 
 
