@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
@@ -76,7 +77,7 @@ class TimestampStructure:
             out[0] = share_at(events.t, self.step)
         if self.line:
             lines, place = readout_lines(events, self.direction)
-            out[1] = share_in_scan(events.t, place, self.line, lines)
+            out[1] = share_at(*scan_begins(events.t, place, self.line, lines))
         return out
 
 
@@ -84,12 +85,36 @@ def share_at(t: NDArray[np.float64], step: float, slack: float = 0.0) -> float:
     """Return the share of times whole steps apart, but for `slack` and the rounding of the file [s]."""
     turn = t / step
     phase = np.angle(np.exp(2j * np.pi * (turn - np.floor(turn))).mean()) / (2 * np.pi)
-    off = np.abs(turn - phase - np.round(turn - phase)) * step
-    return float(np.mean(off <= max(min(1.1 * PATTERNS.file_step, 0.2 * step), slack)))
+    late = turn - phase
+    off = np.abs(late - np.round(late)) * step
+    return float(np.mean(off <= _tolerance(step, slack)))
 
 
-def share_in_scan(t: NDArray[np.float64], place: NDArray[np.float64], line: float, lines: int) -> float:
-    """Return the share of times at which a readout that goes from line to line is at the pixel's.
+def is_certain(t: NDArray[np.float64], step: float, slack: float = 0.0) -> bool:
+    """Whether times are as often whole steps apart as is certain, but for `slack` and rounding [s].
+
+    If so, few of every fourth time are off, and the others are at nearly one phase. Where these are not, the
+    rest is not looked at.
+    """
+    off = 4 * (1 - PATTERNS.certain)
+    least = (1 - off) * math.cos(2 * math.pi * _tolerance(step, slack) / step) - off
+    turn = t[::4] / step
+    angle = (2 * np.pi * (turn - np.floor(turn))).astype(np.float32)  # exact enough
+    if math.hypot(np.cos(angle).mean(), np.sin(angle).mean()) < least - 0.05:
+        return False
+    return share_at(t, step, slack) >= PATTERNS.certain
+
+
+def _tolerance(step: float, slack: float) -> float:
+    return max(min(1.1 * PATTERNS.file_step, 0.2 * step), slack)
+
+
+def scan_begins(
+    t: NDArray[np.float64], place: NDArray[np.float64], line: float, lines: int
+) -> tuple[NDArray[np.float64], float, float]:
+    """Return when scans begin, (N,), what one takes, and by how much it may be late [s].
+
+    As the times tell at which a readout that goes from line to line is at the pixel's.
 
     Args:
         t: Times of events [s], shape (N,).
@@ -97,7 +122,7 @@ def share_in_scan(t: NDArray[np.float64], place: NDArray[np.float64], line: floa
         line: Time of a line [s].
         lines: In a scan.
     """
-    return share_at(t - place * line, lines * line, PATTERNS.pause * lines * line)
+    return t - place * line, lines * line, PATTERNS.pause * lines * line
 
 
 def readout_lines(events: Events, direction: str) -> tuple[int, NDArray[np.float64]]:
@@ -120,8 +145,8 @@ def find_structure(events: Events) -> TimestampStructure:
     if best.line:
         scan = best.line * readout_lines(events, best.direction)[0]
         best = replace(best, line=line_time(events, best.direction, scan))
-    elif clock_period(events.t[: PATTERNS.ticked]):  # the lines of a scan are read at ticks too
-        best = TimestampStructure(step=clock_period(events.t))
+    elif step := clock_period(events.t[: PATTERNS.ticked]):  # the lines of a scan are read at ticks too
+        best = TimestampStructure(step=clock_period(events.t) if len(events) > PATTERNS.ticked else step)
     return best if best.shares(events).max() >= PATTERNS.certain else TimestampStructure()
 
 
@@ -133,7 +158,7 @@ def clock_period(t: NDArray[np.float64]) -> float:
         return 0.0
     step = float(np.quantile(gaps, 0.02))
     step = refine_period(t, step)
-    regular = share_at(t, step) >= PATTERNS.certain and spread_over(t, step)
+    regular = is_certain(t, step) and spread_over(t, step)
     return step if regular and not in_turns(t, step) else 0.0
 
 
@@ -147,12 +172,12 @@ def in_turns(t: NDArray[np.float64], step: float) -> bool:
 
 
 def refine_period(t: NDArray[np.float64], step: float) -> float:
-    """Return the step [s] near `step` that stamps (N,) are multiples of, from ever longer stretches."""
+    """Return the step [s] near `step` that stamps (N,) in order are multiples of, from ever longer parts."""
     for span in np.geomspace(30 * step, max(float(t[-1]), 60 * step), 12):
-        part = t[t <= t[0] + span]
-        ticks_ = np.round((part - part[0]) / step)
+        gone = t[: np.searchsorted(t, t[0] + span, side="right")] - t[0]
+        ticks_ = np.round(gone / step)
         if ticks_[-1] > 0:
-            step = float((ticks_ * (part - part[0])).sum() / (ticks_ * ticks_).sum())
+            step = float((ticks_ * gone).sum() / (ticks_ * ticks_).sum())
     return step
 
 
@@ -180,9 +205,9 @@ def line_time(events: Events, direction: str, scan: float = 0.0) -> float:
     shortest = {float(np.quantile(some, 0.02)) for some in (gaps, longer) if len(some) >= 50}
     tried = [gap / many for many in range(1, PATTERNS.multiples + 1) for gap in sorted(shortest)]
     # all stamps of a line are at one phase of the scan; phases of lines follow each other
-    busy = np.bincount(where.astype(np.int64), minlength=lines).argmax()
+    busiest = t[where == np.bincount(where.astype(np.int64), minlength=lines).argmax()]
     for start in [scan] if scan else tried:
-        line = refine_period(t[where == busy], start) / lines
-        if line > 0 and share_in_scan(events.t, place, line, lines) >= PATTERNS.certain:
+        line = refine_period(busiest, start) / lines
+        if line > 0 and is_certain(*scan_begins(events.t, place, line, lines)):
             return line
     return 0.0

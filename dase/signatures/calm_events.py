@@ -8,12 +8,20 @@ from numpy.typing import NDArray
 
 from dase.events import Events
 from dase.kernels import launch
+from dase.kernels.event_groups import count_busy_cells, measure_intervals, run_on_arrays
 from dase.kernels.event_neighbours import mark_crowded
 
 
 def row_major_pixels(events: Events) -> NDArray[np.int32]:
     """Return the pixel of each event, shape (N,)."""
     return events.y.astype(np.int32) * np.int32(events.width) + events.x
+
+
+def intervals_of_pixels(events: Events) -> NDArray[np.float64]:
+    """Return the time since the event before of the same pixel [s], shape (N,); inf where there is none."""
+    last, out = np.full(events.width * events.height, -np.inf), np.empty(len(events))
+    run_on_arrays(measure_intervals, events.t, row_major_pixels(events), last, out)
+    return out
 
 
 class CalmFilter:
@@ -90,26 +98,16 @@ class CalmShare:
     """
 
     def __init__(self, width: int, height: int, begin: float, filter: CalmFilter):
-        side = 2 * filter.reach + 1
-        self._columns, self._side = -(-width // side), side
-        self._blocks = self._columns * -(-height // side)
-        self._begin, self._span = begin, 2 * filter.gap
-        self._busy = 0
-        self._newest = np.empty(0, np.int64)
+        self._side, self._span, self._begin = 2 * filter.reach + 1, 2 * filter.gap, begin
+        self._newest = np.full((-(-height // self._side), -(-width // self._side)), -1)
+        self._busy = np.zeros(1, np.int32)
 
     def push(self, events: Events) -> None:
         """Take events that follow those before."""
-        if not len(events):
-            return
-        span = ((events.t - self._begin) / self._span).astype(np.int64)
-        block = (events.y // self._side).astype(np.int64) * self._columns + events.x // self._side
-        cells = np.unique(span * self._blocks + block)
-        # the last span of the piece before may go on in this one, and in the next
-        known = np.union1d(self._newest, cells)
-        self._busy += len(known) - len(self._newest)
-        self._newest = known[known >= span[-1] * self._blocks]
+        where = events.t, events.x, events.y
+        run_on_arrays(count_busy_cells, *where, self._begin, self._span, self._side, self._newest, self._busy)
 
     def share(self, end: float) -> float:
         """Return the share of cells of space and time without an event, from begin to `end` [s]."""
         spans = int((end - self._begin) / self._span) + 1
-        return max(0.0, 1 - self._busy / (spans * self._blocks))
+        return max(0.0, 1 - int(self._busy[0]) / (spans * self._newest.size))

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dase.events import Events
+from dase.kernels.event_groups import count_by_time_and_tile, run_on_arrays
 
 
 @dataclass(frozen=True)
@@ -32,8 +33,9 @@ class ClockCounts:
         self.settings = settings or ClockSettings()
         self.begin = 0.0
         """When the first step begins [s]."""
-        self._column = np.arange(width) * self.settings.tiles // width
-        self._row = np.arange(height) * self.settings.tiles // height * self.settings.tiles
+        tiles = self.settings.tiles
+        self._column = np.arange(width, dtype=np.int32) * tiles // width
+        self._row = np.arange(height, dtype=np.int32) * tiles // height * tiles
         self._counts = np.zeros((0, 2, self.settings.tiles**2), np.uint32)
         self._used = 0
 
@@ -44,29 +46,23 @@ class ClockCounts:
         if not self._used:
             self.begin = float(events.t[0])
         step = self.settings.step
-        inside = np.searchsorted(events.t, self.begin + self.settings.longest)
-        bins = ((events.t[:inside] - self.begin) / step).astype(np.int64)
-        start = 0
-        while start < inside:
-            # the table of a quiet recording is mostly empty: not more than two seconds of it at once
-            first = int(bins[start])
-            stop = int(np.searchsorted(bins, first + int(2 / step)))
-            self._add(events, bins, slice(start, stop))
-            start = stop
+        part = events.select(slice(int(np.searchsorted(events.t, self.begin + self.settings.longest))))
+        if not len(part):
+            return
+        self._make_room(int((part.t[-1] - self.begin) / step) + 1)
+        columns = part.t, part.x, part.y, part.p
+        run_on_arrays(
+            count_by_time_and_tile, *columns, self.begin, step, self._row, self._column, self._counts
+        )
 
-    def _add(self, events: Events, bins: NDArray[np.int64], part: slice) -> None:
-        cells = 2 * self.settings.tiles**2
-        first, last = int(bins[part.start]), int(bins[part.stop - 1])
-        tile = self._row[events.y[part]] + self._column[events.x[part]]
-        place = (bins[part] - first) * cells + events.p[part] * (cells // 2) + tile
-        found = np.bincount(place, minlength=(last + 1 - first) * cells)
-        if last >= len(self._counts):
+    def _make_room(self, steps: int) -> None:
+        """Take up so many steps of the table, which grows by doubling up to the longest time."""
+        if steps > len(self._counts):
             most = int(round(self.settings.longest / self.settings.step)) + 1
-            room = np.zeros((min(max(2 * last, 2000), most), *self._counts.shape[1:]), np.uint32)
+            room = np.zeros((min(max(2 * steps, 2000), most), *self._counts.shape[1:]), np.uint32)
             room[: len(self._counts)] = self._counts
             self._counts = room
-        self._counts[first : last + 1] += found.reshape(-1, 2, cells // 2).astype(np.uint32)
-        self._used = max(self._used, last + 1)
+        self._used = max(self._used, steps)
 
     @property
     def counts(self) -> NDArray[np.uint32]:

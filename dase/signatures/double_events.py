@@ -33,6 +33,7 @@ from scipy import stats
 from dase.events import Events
 from dase.formatting import format_count, format_percent, format_seconds
 from dase.kernels import launch
+from dase.kernels.event_groups import mark_times_of_many, run_on_arrays
 from dase.kernels.event_neighbours import count_short_intervals
 from dase.signatures.calm_events import row_major_pixels
 from dase.signatures.chance import poisson_interval
@@ -153,11 +154,12 @@ class IntervalCounts:
     def _count_intervals(self, events: Events, shared: NDArray[np.bool_]) -> None:
         pixel = row_major_pixels(events)
         self.at_own_times += int(np.count_nonzero(~shared))
-        for polarity, row in enumerate(self.events):
-            row += np.bincount(pixel[events.p == polarity], minlength=len(row))
+        row = np.int32(self.events.shape[1])
+        sent = np.bincount(pixel + row * events.p, minlength=self.events.size)
+        self.events += sent.reshape(self.events.shape)
         columns = (
-            (events.t, wp.float64), (pixel, int), (events.p.astype(np.uint8), wp.uint8),
-            (shared.astype(np.uint8), wp.uint8),
+            (events.t, wp.float64), (pixel, int),
+            (events.p.view(np.uint8), wp.uint8), (shared.view(np.uint8), wp.uint8),
             # whole microseconds as floating point numbers: 20 of them are not less than 20
             (self.edges - 1e-9, wp.float64), (self.late_edges - 1e-9, wp.float64),
             (self._last, wp.float64), (self._interval, wp.float64), (self._polarity, wp.uint8),
@@ -178,14 +180,9 @@ def times_of_many(
         asked: Places of K of them.
         settings: What is a double event.
     """
-    s = settings or DoubleSettings()
-
-    def others(reach: float) -> NDArray[np.int64]:
-        out: NDArray[np.int64] = np.searchsorted(t, t[asked] + reach, side="right")
-        return out - np.searchsorted(t, t[asked] - reach) - 1
-
-    out: NDArray[np.bool_] = others(s.tie) > s.shared * others(s.far)
-    return out
+    s, out = settings or DoubleSettings(), np.empty(len(t), np.bool_)
+    run_on_arrays(mark_times_of_many, t, s.tie, s.far, s.shared, out)
+    return out[asked]
 
 
 def find_double_events(

@@ -13,10 +13,13 @@ from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
+import warp as wp
 from numpy.typing import NDArray
 from scipy import stats
 from scipy.ndimage import maximum_filter1d, uniform_filter1d
 
+from dase.kernels import launch
+from dase.kernels.folded_rates import find_fold_heights
 from dase.signatures.clock import ClockCounts
 
 
@@ -102,6 +105,11 @@ class _Excess:
         self.excess = (self.counts - self.usual) * weight
         self.variance = self.usual * weight**2
         self.side = round(math.sqrt(counts.shape[1]))
+        # of each row of tiles, shape (side, K)
+        self._of_bands, self._variance_of_bands = (
+            np.ascontiguousarray(table.reshape(-1, self.side, self.side).sum(2).T)
+            for table in (self.excess, self.variance)
+        )
         self.beat = _find_beat(self.aligned(0.0)[0], step, settings)
 
     def delays_of_bands(self, delay: float) -> NDArray[np.int64]:
@@ -121,13 +129,11 @@ class _Excess:
         steps = self.delays_of_bands(delay)
         before, behind = max(-int(steps.min()), 0), max(int(steps.max()), 0)
         count = len(self.counts) - before - behind
-        bands = self.excess.reshape(len(self.counts), self.side, self.side).sum(2)
-        spreads = self.variance.reshape(bands.shape[0], self.side, self.side).sum(2)
         above, variance = np.zeros(count), np.zeros(count)
         for band, late in enumerate(steps):
             rows = slice(before + late, before + late + count)
-            above += bands[rows, band]
-            variance += spreads[rows, band]
+            above += self._of_bands[band, rows]
+            variance += self._variance_of_bands[band, rows]
         out = above / np.sqrt(variance + 1e-9)
         out -= uniform_filter1d(out, self.width, mode="nearest")
         out = np.clip(out, -self.settings.most, self.settings.most)
@@ -153,8 +159,11 @@ def find_faint_bursts(clock: ClockCounts, settings: FaintBurstSettings = FAINT) 
     excess = [_Excess(counts[:, polarity], step, s) for polarity in range(2)]
     for polarity, delay in product(range(2), delays):
         rate, _ = excess[polarity].aligned(float(delay))
-        for period in _likely_periods(rate, step, s):
-            found.append((float(_fold(rate, period)[0].max()), polarity, float(delay), period))
+        periods = _likely_periods(rate, step, s)
+        found += [
+            (float(height), polarity, float(delay), float(period))
+            for height, period in zip(_fold_heights(rate, periods), periods, strict=True)
+        ]
     found.sort(reverse=True)
     best: tuple[float, int, float, float] | None = None
     for _, polarity, delay, period in found[: s.best]:
@@ -230,18 +239,16 @@ def _height_of_turns(
     again: NDArray[np.float64], periods: NDArray[np.float64], turns: Sequence[int]
 ) -> NDArray[np.float64]:
     """Return how much a rate comes again after turns of each period, in standard errors, shape (P,)."""
-    height, pairs = np.zeros(len(periods)), np.ones(len(periods))
-    for turn in turns:
-        lag = np.round(periods * turn).astype(np.int64)
-        inside = lag < 0.85 * len(again)  # of more, few pairs are left
-        height[inside] += again[lag[inside]]
-        pairs[inside] += len(again) - lag[inside]
+    lag = np.round(np.outer(turns, periods)).astype(np.int64)
+    inside = lag < 0.85 * len(again)  # of more, few pairs are left
+    height = np.where(inside, again[np.minimum(lag, len(again) - 1)], 0.0).sum(0)
+    pairs = 1 + np.where(inside, len(again) - lag, 0).sum(0)
     out: NDArray[np.float64] = height / np.sqrt(pairs)
     return out
 
 
-def _likely_periods(rate: NDArray[np.float64], step: float, s: FaintBurstSettings) -> list[float]:
-    """Return periods [steps] after which, and after multiples of which, a rate comes again most."""
+def _likely_periods(rate: NDArray[np.float64], step: float, s: FaintBurstSettings) -> NDArray[np.float64]:
+    """Return periods [steps] after which, and their multiples, a rate comes again most, shape (P,)."""
     again = maximum_filter1d(_again(rate), 3)
     longest = len(rate) / s.fewest_frames
     tried = np.exp(np.arange(math.log(s.shortest / step), math.log(longest), 2e-3))
@@ -252,7 +259,7 @@ def _likely_periods(rate: NDArray[np.float64], step: float, s: FaintBurstSetting
             out.append(float(tried[n]))
         if len(out) == s.periods:
             break
-    return out
+    return np.array(out)
 
 
 def _places(count: int, period: float) -> NDArray[np.int64]:
@@ -269,13 +276,21 @@ def _fold(rate: NDArray[np.float64], period: float) -> tuple[NDArray[np.float64]
     return each.sum(0) / math.sqrt(max(len(each), 1)), each
 
 
+def _fold_heights(rate: NDArray[np.float64], periods: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the largest mean of a rate folded on each period [steps], in standard errors, shape (P,)."""
+    cpu, heights = launch.find_device("cpu"), np.empty(len(periods))
+    inputs = [wp.array(a, dtype=wp.float64, device=cpu, copy=False) for a in (rate, periods, heights)]
+    launch.run_kernel(find_fold_heights, len(periods), inputs, cpu)
+    return heights
+
+
 def _refine(rate: NDArray[np.float64], about: float, reach: float = 0.012) -> tuple[float, float]:
     """Return the greatest folded rate near a period [steps], and its period."""
     # fine enough that the first and the last frame keep step
     tried = about * (1 + np.arange(-reach, reach, 0.3 / len(rate)))
-    heights = [float(_fold(rate, float(one))[0].max()) for one in tried]
+    heights = _fold_heights(rate, tried)
     best = int(np.argmax(heights))
-    return heights[best], float(tried[best])
+    return float(heights[best]), float(tried[best])
 
 
 def _describe(

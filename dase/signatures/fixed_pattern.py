@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from dase.events import Events
 from dase.formatting import format_percent, format_seconds
-from dase.signatures.calm_events import row_major_pixels
+from dase.signatures.calm_events import intervals_of_pixels, row_major_pixels
 from dase.signatures.chance import NINETY, sign_flip_tail
 from dase.signatures.kinds import FIXED_PATTERN
 from dase.signatures.result import Answer, Signature, judge_signature, without_answer
@@ -135,9 +135,8 @@ def _sum_blocks(field: NDArray[np.float64], block: int) -> NDArray[np.float64]:
 
 def _dead_time(events: Events, s: PatternSettings) -> float:
     """Return the time that pixels are deaf after an event [s], if many wait for its end; else 0."""
-    pixel = row_major_pixels(events)
-    order = np.argsort(pixel, kind="stable")  # events are sorted by time
-    intervals = np.sort(np.diff(events.t[order])[np.diff(pixel[order]) == 0])
+    intervals = intervals_of_pixels(events)
+    intervals = np.sort(intervals[intervals < np.inf])
     if not len(intervals):
         return 0.0
     tried = np.geomspace(*s.dead, 36)

@@ -131,13 +131,10 @@ def _sum_blocks(v: NDArray[np.float64], step: float, s: FlickerSettings) -> _Ton
     # and a block's middle turns with the frequency
     frequencies = np.arange(int(0.45 / step / spacing)) * spacing
     nearest = np.rint(frequencies / cell).astype(np.int64)
-    rayleigh, total = np.zeros(len(frequencies)), np.zeros(len(frequencies))
-    start = np.flatnonzero(np.diff(nearest, prepend=-1))
-    for i, j in zip(start, [*start[1:], len(frequencies)], strict=True):
-        place = np.arange(i, j) % many
-        rayleigh[i:j] = np.abs(np.fft.fft(phases[:, nearest[i]], many)[place]) ** 2 / filled
-        total[i:j] = np.abs(np.fft.fft(spectrum[:, nearest[i]], many)[place]) ** 2
-    return _Tones(rayleigh, total, spacing)
+    places = nearest, np.arange(len(frequencies)) % many
+    cells = nearest[-1] + 1
+    turning, turning_sum = (np.fft.fft(one[:, :cells].T, many)[places] for one in (phases, spectrum))
+    return _Tones(np.abs(turning) ** 2 / filled, np.abs(turning_sum) ** 2, spacing)
 
 
 def _find_tone(

@@ -9,12 +9,21 @@ so events count only where the pixels beside them on the line are silent.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
 from dase.events import Events
+from dase.kernels.event_groups import (
+    count_line_pairs,
+    mark_with_neighbours,
+    measure_own_gaps,
+    order_within_stamps,
+    run_on_arrays,
+)
+from dase.signatures.calm_events import row_major_pixels
 from dase.signatures.chance import ratio_interval, sign_flip_tail
 from dase.signatures.kinds import GROUPING
 from dase.signatures.result import Answer, Signature, judge_signature, without_answer
@@ -72,57 +81,22 @@ class GroupCounts:
 
     def _count_block(self, block: Events) -> None:
         s = self.settings
-        kept = ~self._hot[block.y.astype(np.int64) * block.width + block.x]
-        t, x, y = block.t[kept], block.x[kept].astype(np.int32), block.y[kept].astype(np.int32)
+        kept = np.flatnonzero(~self._hot[row_major_pixels(block)])
+        t = block.t[kept]
         if len(t) <= s.lags[-1]:
             return
         # files sort events of one stamp as they like: that is no readout
-        order = _shuffled_within_stamps(t, self._random)
-        x, y = x[order], y[order]
-        free = [~_may_be_of_an_edge(t, *axes, s) for axes in ((x, y), (y, x))]
-        for i in range(s.together):
-            run = slice(i * len(t) // s.together, (i + 1) * len(t) // s.together)
-            tables = [
-                self._count_pairs(t[run], along[run], across[run], some[run])
-                for along, across, some in ((x, y, free[0]), (y, x, free[1]))
-            ]
-            if any(pairs for _, _, pairs in tables):
-                self._next.append(np.array([one for one, _, _ in tables]))
-                self._later.append(np.array([later for _, later, _ in tables]))
-
-    def _count_pairs(
-        self,
-        t: NDArray[np.float64],
-        along: NDArray[np.int32],
-        across: NDArray[np.int32],
-        free: NDArray[np.bool_],
-    ) -> tuple[NDArray[np.int64], NDArray[np.float64], int]:
-        """Return pairs of successive events, mean pairs of later ones, each (2,), and all later pairs.
-
-        Of events that are `free`, in places along and numbers of their lines, all of shape (N,).
-        """
-        s = self.settings
-        nothing = np.zeros(2, np.int64), np.zeros(2), 0
-
-        def shared(lag: int) -> tuple[NDArray[np.int64], int, float]:
-            """Return pairs of one line and of lines near by, all pairs soon enough, and their share."""
-            soon = t[lag:] - t[:-lag] < s.span
-            kept = np.flatnonzero(soon & free[lag:] & free[:-lag])
-            apart = np.abs(across[kept + lag] - across[kept])
-            near = kept[apart <= s.beside]
-            far = np.abs(along[near + lag] - along[near]) > s.away
-            line = apart[apart <= s.beside][far]
-            same = np.count_nonzero(line == 0)
-            return np.array([same, len(line) - same]), len(kept), float(soon.mean())
-
-        if len(t) <= s.lags[-1]:
-            return nothing
-        one, count, _ = shared(1)
-        others = [shared(lag) for lag in s.lags]
-        pairs = sum(n for _, n, _ in others)
-        if pairs == 0 or np.mean([share for _, _, share in others]) < 0.5:
-            return nothing
-        return one, np.sum([many for many, _, _ in others], axis=0) * (count / pairs), pairs
+        chosen = kept[_shuffled_within_stamps(t, self._random)]
+        place = np.array((block.x[chosen], block.y[chosen]), np.int32)
+        of_an_edge = _may_be_of_an_edge(t, place, (block.height, block.width), s)
+        begins = np.arange(s.together + 1, dtype=np.int32) * len(t) // s.together
+        free, pairs = _count_pairs(t, place, of_an_edge, begins, s)
+        for run, (begin, end) in enumerate(pairwise(begins)):
+            later = free[run, :, 1:].sum(1, keepdims=True)  # (2, 1)
+            if not later.any() or _share_soon(t[begin:end], s) < 0.5:
+                continue
+            self._next.append(np.where(later, pairs[run, :, 0], 0))
+            self._later.append(pairs[run, :, 1:].sum(1) * (free[run, :, :1] / np.maximum(later, 1)))
 
     @property
     def runs(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -136,20 +110,36 @@ class GroupCounts:
         return np.array(self._next, np.float64), np.array(self._later, np.float64)
 
 
-def _shuffled_within_stamps(t: NDArray[np.float64], random: np.random.Generator) -> NDArray[np.int64]:
+def _shuffled_within_stamps(t: NDArray[np.float64], random: np.random.Generator) -> NDArray[np.int32]:
     """Return an order of events, sorted by time, in which those of one stamp come as they like."""
     draws = random.random(len(t))
-    order = np.arange(len(t))
+    order = np.arange(len(t), dtype=np.int32)
     alike = t[1:] == t[:-1]
-    shared = np.flatnonzero(np.append(alike, False) | np.append(False, alike))
-    order[shared] = shared[np.lexsort((draws[shared], t[shared]))]
+    shared = order[np.append(alike, False) | np.append(False, alike)]
+    first = np.maximum.accumulate(np.where(np.append(False, alike), 0, order))
+    drawn = shared[np.argsort(draws[shared])]
+    run_on_arrays(order_within_stamps, first, drawn, order.copy(), order)
     return order
 
 
+def _share_soon(t: NDArray[np.float64], settings: GroupingSettings) -> float:
+    """Return the share of pairs of later events of a run that come soon enough; 0 where there are too few.
+
+    Args:
+        t: Times, sorted [s], shape (N,).
+        settings: How many events later, and how soon.
+    """
+    s = settings
+    if len(t) <= s.lags[-1]:
+        return 0.0
+    soon = [np.count_nonzero(t[lag:] - t[:-lag] < s.span) / (len(t) - lag) for lag in s.lags]
+    return float(np.mean(soon))
+
+
 def _may_be_of_an_edge(
-    t: NDArray[np.float64], along: NDArray[np.int32], across: NDArray[np.int32], settings: GroupingSettings
-) -> NDArray[np.bool_]:
-    """Return which events an edge along their line may have made, shape (N,).
+    t: NDArray[np.float64], place: NDArray[np.int32], shape: tuple[int, int], settings: GroupingSettings
+) -> NDArray[np.int32]:
+    """Return which events an edge along their line may have made, shape (N,): 1 row, 2 column, 3 either.
 
     Pixels of such an edge see the same light. Where they are alike and each has sent before, each sends once
     between two events of one of them, all at one instant if their memories were set in the same light. So an
@@ -158,42 +148,47 @@ def _may_be_of_an_edge(
 
     Args:
         t: Times, sorted [s], shape (N,).
-        along: Places along the lines [px].
-        across: Numbers of the lines.
+        place: Columns and rows [px], shape (2, N).
+        shape: Rows and columns of the sensor.
         settings: How near is beside; the longest time.
     """
-    count, index = len(t), np.arange(len(t))
-    pixel = across.astype(np.int64) * (1 << 16) + along
-    # lexsort keeps what is alike in its order, and counts numbers of 16 bits instead of comparing them
-    order = np.lexsort((along.astype(np.uint16), across.astype(np.uint16)))
-    gaps = np.where(np.diff(pixel[order]) == 0, np.diff(t[order]), settings.span)
-    alone = np.full(1, settings.span)
-    own = np.empty(count)
-    own[order] = np.minimum(np.concatenate((alone, gaps)), np.concatenate((gaps, alone)))
-    own = np.minimum(own, settings.span)
-    # at least as far as the events with which successive ones are compared, and all of one stamp
-    reach = settings.lags[-1]
-    begins = np.flatnonzero(np.append(True, np.diff(t) > 0))  # of stamps
-    lengths = np.diff(np.append(begins, count))
-    low = np.maximum(np.repeat(begins, lengths) - reach, 0)
-    high = np.minimum(np.repeat(begins + lengths, lengths) + reach, count) - 1
-    # times are searched only where they lie further off than that
-    early, late = t[low] >= t - own, t[high] <= t + own
-    low[early] = np.searchsorted(t, (t - own)[early])
-    high[late] = np.searchsorted(t, (t + own)[late], "right") - 1
-    cut = (t - own < t[0]) | (t + own > t[-1])  # what is beside them is not at hand
-    keys = (pixel * count + index)[order]
-    low, high = keys + (low[order] - index[order]), keys + (high[order] - index[order])
-    near = cut[order]
-    for step in range(1, settings.away + 1):
-        for away in (-step * count, step * count):
-            open_ = np.flatnonzero(~near)
-            first = np.searchsorted(keys, low[open_] + away)
-            first[first == count] = count - 1  # the last key is below what is looked for, then
-            near[open_] = (keys[first] >= low[open_] + away) & (keys[first] <= high[open_] + away)
-    out = np.empty(count, np.bool_)
-    out[order] = near
+    s, gaps, out = settings, np.empty(len(t)), np.zeros(len(t), np.int32)
+    run_on_arrays(measure_own_gaps, t, place, s.span, np.full(shape, -1, np.int32), gaps)
+    for sign in (1, -1):
+        seen = np.full([side + 2 * s.away for side in shape], -1, np.int32)
+        # at least as far as the events with which successive ones are compared, and all of one stamp
+        run_on_arrays(mark_with_neighbours, t, place, gaps, s.lags[-1], s.away, sign, seen, out)
     return out
+
+
+def _count_pairs(
+    t: NDArray[np.float64],
+    place: NDArray[np.int32],
+    of_an_edge: NDArray[np.int32],
+    begins: NDArray[np.int32],
+    settings: GroupingSettings,
+) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+    """Return pairs of events of a run that are one apart, and as many as `lags` [events], L in all.
+
+    Args:
+        t: Times, sorted [s], shape (N,).
+        place: Columns and rows [px], shape (2, N).
+        of_an_edge: Events that do not count, shape (N,): 1 on their row, 2 on their column, 3 on both.
+        begins: Of runs, and the end of the last, shape (R + 1,).
+        settings: Which pairs count.
+
+    Returns:
+        All that come soon enough, on rows and on columns, shape (R, 2, L), and those of these that are of one
+        line, and of lines near by, shape (R, 2, L, 2).
+    """
+    s, lags = settings, np.array((1, *settings.lags), np.int32)
+    free = np.zeros((len(begins) - 1, 2, len(lags)), np.int32)
+    pairs = np.zeros((*free.shape, 2), np.int32)
+    run_on_arrays(
+        count_line_pairs, t, place, of_an_edge, begins, lags, s.span, s.beside, s.away, free, pairs,
+        dim=(len(begins) - 1, len(lags)),
+    )  # fmt: skip
+    return free, pairs
 
 
 def _test_line(

@@ -19,7 +19,7 @@ from dase.events import Events
 from dase.formatting import format_count, format_percent, format_seconds
 from dase.probes import timestamp_patterns
 from dase.recordings.interval_statistics import IntervalStatistics
-from dase.signatures.calm_events import row_major_pixels
+from dase.signatures.calm_events import intervals_of_pixels, row_major_pixels
 from dase.signatures.kinds import TIME_STAMPS
 from dase.signatures.result import Answer, Signature, judge_signature, without_answer
 
@@ -90,10 +90,7 @@ def _find_period(events: Events, s: StampSettings) -> Signature | None:
     that see the same send at the same intervals: as many count as there are different multiples.
     """
     intervals = IntervalStatistics()
-    pixel = row_major_pixels(events)
-    order = np.argsort(pixel, kind="stable")
-    pixel, t = pixel[order], events.t[order]
-    between = np.diff(t)[pixel[1:] == pixel[:-1]]
+    between = intervals_of_pixels(events)
     # of a pixel that sends twice, the second says nothing of the scan
     between = between[(between > timestamp_patterns.PATTERNS.shortest) & (between < 0.065)]
     intervals.add(between)

@@ -25,9 +25,9 @@ ARCH = 90
 """Compute capability that is compiled for: H100 and H200."""
 
 MODULES = (
-    "critic_layers", "critic_products", "critic_rows", "event_keys", "event_neighbours", "event_order",
-    "event_probes", "event_queue", "patch_structure", "pixel_codegen_trials", "scene_batch", "scene_blur",
-    "scene_frames", "scene_layers", "scene_layers_gradient", "scene_paths",
+    "critic_layers", "critic_products", "critic_rows", "event_groups", "event_keys", "event_neighbours",
+    "event_order", "event_probes", "event_queue", "folded_rates", "patch_structure", "pixel_codegen_trials",
+    "scene_batch", "scene_blur", "scene_frames", "scene_layers", "scene_layers_gradient", "scene_paths",
     "threshold_surrogates",
 )  # fmt: skip
 """Those whose kernels are not made by functions."""
