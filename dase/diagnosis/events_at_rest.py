@@ -111,8 +111,8 @@ class EventsAtRestSettings:
     """Such times over which the mean is taken that they are compared with."""
 
     fullest: float = 0.5
-    """Share of the events in the fullest tenth of such times, at most, where these have two or more in the mean:
-    bursts of frames of both polarities had 0.98, noise of six clips of other simulators 0.12 to 0.23."""
+    """Share of the events in the fullest tenth of such times, at most, where they are two a time in the mean
+    or more: bursts of frames of both polarities had 0.98, noise of six clips of others 0.12 to 0.23."""
 
     pairs: int = 60
     """Successive events of one pixel from which on these tell which noise it is."""
