@@ -21,6 +21,7 @@ from dase.errors import InputError
 from dase.events import Events
 from dase.fitting.frame_steps import comes_before_its_light
 from dase.fitting.held_clips import holds_frames
+from dase.fitting.held_parts import parts_that_are_held
 from dase.fitting.screen_alignment import screen_scene
 from dase.formatting import fit_to_screen, format_seconds
 from dase.io.arrays import check_archive
@@ -202,14 +203,25 @@ def _as_shown(measurement: Measurement) -> Measurement:
             f"{format_seconds(begun.early)} earlier"
         )
         return replace(measurement, scene=begun, notes=(*measurement.notes, note))
-    if not holds_frames(measurement.events, scene):
+    parts = parts_that_are_held(measurement.events, scene)
+    if not parts and not holds_frames(measurement.events, scene):
         return measurement
-    shown = scene.held(STIMULUS.common_step)
-    return replace(measurement, scene=shown, notes=(*measurement.notes, note_of_held_frames(shown)))
+    shown = (scene.in_parts(parts) if parts else scene).held(STIMULUS.common_step)
+    return replace(measurement, scene=shown, notes=(*measurement.notes, note_of_held_frames(shown, parts)))
 
 
-def note_of_held_frames(scene: VideoScene) -> str:
-    """Return what a user should know of a clip whose frames are held."""
+def note_of_held_frames(scene: VideoScene, parts: int = 0) -> str:
+    """Return what a user should know of a clip whose frames are held.
+
+    Args:
+        scene: As it is shown.
+        parts: Pictures from frame to frame, each of which is held; 0 where it is the frames that are.
+    """
+    if parts:
+        return (
+            f"events tell of {parts} pictures from each frame of the clip to the next, each held for "
+            f"{format_seconds(scene.held_for)}: between the frames light is taken to go straight"
+        )
     return (
         f"events tell of each frame at the one before: the clip is taken {format_seconds(scene.held_for)} "
         "earlier, and each of its frames is held"

@@ -257,6 +257,31 @@ class VideoScene(Scene):
         """Return the longest time from frame to frame [s]; 0 for one frame."""
         return self.held_for or float(np.diff(self._times).max(initial=0.0))
 
+    def in_parts(self, parts: int) -> VideoScene:
+        """Return the clip with pictures between its frames, straight in intensity, all of them in memory.
+
+        Args:
+            parts: From each frame to the next.
+        """
+        light = to_light(self._frames[np.arange(len(self._times))], gamma=self.gamma)
+        out = np.empty((parts * (len(light) - 1) + 1, *light.shape[1:]), np.float32)
+        out[::parts] = light
+        for part in range(1, parts):
+            out[part::parts] = light[:-1] + np.float32(part / parts) * (light[1:] - light[:-1])
+        inner = self._times[:-1, None] + np.diff(self._times)[:, None] * np.arange(parts) / parts
+        return VideoScene(out, np.append(inner.ravel(), self._times[-1]))
+
+    def of_rows(self, first: int, after: int) -> VideoScene:
+        """Return some rows of the clip.
+
+        Args:
+            first: The first of them.
+            after: The one after the last.
+        """
+        return VideoScene(
+            self._frames[np.arange(len(self._times))][:, first:after], self._times, gamma=self.gamma
+        )
+
     def held(self, step: float) -> VideoScene:
         """Return the light of each frame shown from the time of the one before on, unchanged until its own.
 

@@ -1,0 +1,155 @@
+"""Whether a simulator that was given more pictures than a clip has frames held each of them.
+
+IEBCS may be fed with pictures between the frames of a clip, straight from one to the next, and holds each as
+it holds frames (`dase.fitting.held_clips`). Then events come soon after even parts of the time from frame to
+frame; and with the light of those pictures for the memory of a pixel its thresholds, by what light went
+before an event and with it (`dase.fitting.thresholds_of_frames`), hardly differ, with that of others much.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dase.events import Events
+from dase.fitting.frame_steps import clip_step_of
+from dase.fitting.held_events import HeldEvents, rows_with_most_events
+from dase.fitting.thresholds_of_frames import thresholds_of_frames
+from dase.scenes.scene import Scene
+from dase.scenes.video import VideoScene
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class HeldPartSettings:
+    """When parts of frames are held.
+
+    Chosen on five clips of IEBCS with 4, 5 and 8 pictures per frame (development).
+    """
+
+    most: int = 10
+    """Pictures from frame to frame, at most."""
+
+    least: int = 2_000
+    """Events below which nothing is said."""
+
+    events: int = 100_000
+    """Events whose times are looked at, at most, evenly spread."""
+
+    bins: int = 50
+    """Of the time from picture to picture."""
+
+    quarter: int = 12
+    """Such bins beside each other that are denser than others."""
+
+    dense: float = 0.4
+    """Share of the events in these from which on thresholds are asked: a quarter of those that come at any
+    time."""
+
+    shares: int = 12
+    """Into how many parts, at most, a simulator that knows pictures alone puts the events of one, evenly."""
+
+    even: float = 0.5
+    """Share of the events at such parts, to the microsecond, from which on it is one of these (v2e)."""
+
+    at_once: float = 0.3
+    """Share of the events at one microsecond of it, at most."""
+
+    intensities: int = 400_000
+    """Pixels times frames that tell thresholds, about."""
+
+    room: int = 1 << 28
+    """Pixels times pictures that are held in memory, at most."""
+
+    apart: float = 0.12
+    """What thresholds differ by, relative, at most: 0.0004 to 0.05 in five clips of IEBCS with 4 to 10
+    pictures."""
+
+    decided: float = 0.6
+    """The same, relative to the least with any other number of pictures: 0.003 to 0.48."""
+
+
+HELD_PARTS = HeldPartSettings()
+
+
+def parts_that_are_held(events: Events, scene: Scene, settings: HeldPartSettings = HELD_PARTS) -> int:
+    """Return how many pictures from frame to frame of a clip a simulator held each; 0 where it did not.
+
+    Args:
+        events: Sorted.
+        scene: What they are of; only clips with even frames are asked, and none whose frames are held.
+        settings: When parts are held.
+    """
+    if not isinstance(scene, VideoScene) or scene.held_for or scene.sharp is not None:
+        return 0
+    step, times = clip_step_of(scene), scene.sample_times()
+    inside = slice(*np.searchsorted(events.t, (times[0], times[-1])))
+    many = inside.stop - inside.start
+    if not step or len(times) < 4 or many < settings.least:
+        return 0
+    t = events.t[inside][:: max(1, many // settings.events)]
+    room = settings.room // (len(times) * scene.width * scene.height)
+    numbers = range(2, min(settings.most, room) + 1)
+    likely = [n for n in numbers if _come_together(t - times[0], step / n, settings)]
+    if not likely:
+        return 0
+    events, scene = _of_busiest_rows(events, scene, settings)
+    differ = {parts: _thresholds_differ(events, scene, parts, settings) for parts in likely}
+    best = min(likely, key=differ.__getitem__)
+    if differ[best] > settings.apart:
+        return 0
+    others = [n for n in range(1, settings.most + 1) if n not in likely]
+    differ |= {parts: _thresholds_differ(events, scene, parts, settings) for parts in others}
+    next_best = min(value for parts, value in differ.items() if parts != best)
+    return best if differ[best] <= settings.decided * next_best else 0
+
+
+def _of_busiest_rows(
+    events: Events, scene: VideoScene, settings: HeldPartSettings
+) -> tuple[Events, VideoScene]:
+    """Return the events and the clip of the rows with the most events, as many as tell thresholds."""
+    most = max(1, settings.intensities // (len(scene.sample_times()) * scene.width))
+    first, after = rows_with_most_events(events, most)
+    mine = events.select((events.y >= first) & (events.y < after))
+    moved = Events(mine.t, mine.x, mine.y - first, mine.p, mine.width, after - first)
+    return moved, scene.of_rows(first, after)
+
+
+def _come_together(t: Array, step: float, settings: HeldPartSettings) -> bool:
+    """Return whether more events come in a quarter of each time than if they came at any time.
+
+    Those at its begin, to the microsecond, do not count: noise that is drawn at each picture, and what a
+    simulator that knows pictures alone sends at parts of it.
+
+    Args:
+        t: Of the events, since the first picture [s], shape (N,).
+        step: From picture to picture [s].
+        settings: How many more.
+    """
+    late = t % step
+    parts = np.round(step / np.maximum(late, 1e-9))
+    even = (parts <= settings.shares) & (np.abs(late * parts - step) < 1.1e-6 * parts)
+    late = late[(late > 0.6e-6) & (late < step - 0.6e-6)]
+    if len(late) < settings.least or even.mean() >= settings.even:
+        return False
+    if np.bincount(np.round(1e6 * late).astype(np.int64)).max() > settings.at_once * len(late):
+        return False  # a clock's ticks
+    counts = np.histogram(late / step, settings.bins, (0.0, 1.0))[0]
+    near = np.convolve(np.concatenate([counts, counts]), np.ones(settings.quarter), "valid")
+    return bool(near.max() >= settings.dense * len(late))
+
+
+def _thresholds_differ(events: Events, scene: VideoScene, parts: int, settings: HeldPartSettings) -> float:
+    """Return what thresholds differ by if so many pictures are held from frame to frame; inf where few tell.
+
+    Args:
+        events: Sorted.
+        scene: Their clip.
+        parts: Pictures.
+        settings: How much is looked at.
+    """
+    found = thresholds_of_frames(HeldEvents.of(events, scene.in_parts(parts)))
+    return float(np.mean([one.spread for one in found.values()])) if found else np.inf
