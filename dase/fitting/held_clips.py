@@ -16,6 +16,8 @@ from numpy.typing import NDArray
 
 from dase.events import Events
 from dase.fitting.delays_after_frames import delays_after_frames
+from dase.fitting.held_events import HeldEvents
+from dase.fitting.thresholds_of_frames import thresholds_of_frames
 from dase.probes.stimulus import light_of
 from dase.scenes.scene import LOG_EPS, Scene
 from dase.scenes.video import VideoScene
@@ -99,6 +101,10 @@ class HeldClipSettings:
     later: float = 5.0
     """Standard errors by which events come the later the longer the way, at least: 8 to 38 in those clips,
     -2 to 1 where a readout scans rows from frame to frame."""
+
+    apart_at_most: float = 0.5
+    """What thresholds of such frames differ by, relative, at most: 0.28 in a clip of IEBCS behind a low-pass,
+    0.7 in one of ESIM with a dead time of some frames."""
 
     kinds: int = 4
     """How many different parts these are of, at least: what is held comes at one time after a frame."""
@@ -203,9 +209,11 @@ def _come_by_their_way(
     if near.max() < settings.dense * len(phase):
         return False
     delays = delays_after_frames(events, scene)
-    return (
-        delays is not None and delays.width() <= settings.width and delays.slope_in_errors() >= settings.later
-    )
+    if delays is None or delays.width() > settings.width or delays.slope_in_errors() < settings.later:
+        return False
+    # what appears on a dark ground sends at the begin of a frame, too, and more of it the longer that lasts
+    found = thresholds_of_frames(HeldEvents.of(events, scene)).values()
+    return not found or float(np.mean([one.spread for one in found])) <= settings.apart_at_most
 
 
 def _begin_of_all(phase: NDArray[np.float64], settings: HeldClipSettings = HELD_CLIPS) -> float | None:
