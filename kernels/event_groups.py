@@ -5,12 +5,8 @@ Events are looked at one after the other, as they come, by one thread: each need
 
 from __future__ import annotations
 
-from typing import Any
-
-import numpy as np
 import warp as wp
 
-from dase.kernels import launch
 from dase.kernels.compiler_flags import CPU_FLAGS
 
 wp.set_module_options({"cpu_compiler_flags": CPU_FLAGS, "enable_backward": False})
@@ -253,16 +249,3 @@ def count_line_pairs(
                     apart = wp.abs(place[1 - axis, other] - place[1 - axis, i])
                     if apart <= beside and wp.abs(place[axis, other] - place[axis, i]) > away:
                         pairs_out[run, axis, lag, wp.min(apart, 1)] += 1
-
-
-def run_on_arrays(kernel: wp.Kernel, *inputs: Any, dim: int | tuple[int, ...] = 1) -> None:
-    """Launch a kernel on one thread of the CPU, over the memory of NumPy arrays.
-
-    Args:
-        kernel: One of the above.
-        inputs: Its arguments; arrays of any shape, with the types of numbers that it takes.
-        dim: How often it is called.
-    """
-    cpu = launch.find_device("cpu")
-    lent = [wp.array(a, device=cpu, copy=False) if isinstance(a, np.ndarray) else a for a in inputs]
-    wp.launch(kernel, dim=dim, inputs=lent, device=cpu)

@@ -164,6 +164,19 @@ def run_kernel(
         assert done is None
 
 
+def run_on_arrays(kernel: wp.Kernel, *inputs: Any, dim: int | tuple[int, ...] = 1) -> None:
+    """Launch a kernel on one thread of the CPU, over the memory of NumPy arrays.
+
+    Args:
+        kernel: Takes `inputs` alone.
+        inputs: Its arguments; arrays of any shape, with the types of numbers that it takes.
+        dim: How often it is called.
+    """
+    cpu = find_device("cpu")
+    lent = [wp.array(a, device=cpu, copy=False) if isinstance(a, np.ndarray) else a for a in inputs]
+    wp.launch(kernel, dim=dim, inputs=lent, device=cpu)
+
+
 def run_concurrently(works: Sequence[Callable[[], Result]]) -> list[Result]:
     """Return what works give that pass their time in kernels of the CPU or in NumPy, done on its threads.
 

@@ -34,6 +34,7 @@ from dase.results import Diagnosis, Estimate
 from dase.scenes.between_frames import CameraScene
 from dase.scenes.video import VideoScene
 from dase.signatures import kinds
+from dase.signatures.calm_events import intervals_of_pixels, row_major_pixels
 from dase.signatures.result import Answer, Signature
 from dase.simulation.sensor import Sensor
 from dase.simulation.simulate import simulate
@@ -167,15 +168,12 @@ def intervals_of(events: Events, pixels: NDArray[np.int64] | None = None) -> Arr
         events: Of any polarity, in order of time.
         pixels: Row-major indices of those that count, shape (K,); None for all.
     """
-    at = events.y.astype(np.int64) * events.width + events.x
-    order = np.lexsort((events.x, events.y))
     if pixels is not None:
         counts = np.zeros(events.width * events.height, bool)
         counts[pixels] = True
-        order = order[counts[at][order]]
-    at, t = at[order], events.t[order]
-    out: Array = np.sort(np.diff(t)[at[1:] == at[:-1]])
-    return out
+        events = events.select(counts[row_major_pixels(events)])
+    intervals = intervals_of_pixels(events)
+    return np.sort(intervals[intervals < np.inf])
 
 
 def end_of_intervals(

@@ -32,7 +32,7 @@ from dase.fitting.measurement import Measurement, note_of_held_frames
 from dase.fitting.model import FittedModel, fit_present_model, refit_model, refit_work
 from dase.fitting.parameter_space import axes_of
 from dase.fitting.scheduler import run_side_by_side
-from dase.fitting.thresholds_of_frames import thresholds_of_frames
+from dase.fitting.thresholds_of_frames import spread_of_thresholds
 from dase.formatting import format_seconds
 from dase.probes.random_streams import SimulationStream
 from dase.probes.stimulus import STIMULUS
@@ -134,13 +134,10 @@ def _frames_to_memory(measurement: Measurement, most: int, settings: HeldFrameSe
     seen = HeldEvents.of(measurement.compared_events(), scene, most=settings.few)
     differ = list[float]()
     for wait in range(most, 0, -1):
-        spreads = [one.spread for one in thresholds_of_frames(seen, wait=wait).values()]
-        if not spreads:
+        differ.append(spread_of_thresholds(seen, wait=wait))
+        if not differ[-1] <= min(differ) < np.inf:
             break
-        differ.append(float(np.mean(spreads)))
-        if differ[-1] > min(differ):
-            break
-    if len(differ) < 2:
+    if not min(differ) < np.inf:
         return most, False
     best = int(np.argmin(differ))
     beside = [differ[at] for at in (best - 1, best + 1) if 0 <= at < len(differ)]

@@ -200,12 +200,10 @@ def settle_doubles(task: DiagnosisTask, seen: SeenEffects, model: FittedModel) -
 def settle_leak(
     task: DiagnosisTask, seen: SeenEffects, measurement: Measurement, model: FittedModel
 ) -> SeenEffects:
-    """Return what is seen, less a leak that the last model shows without one.
+    """Return what is seen, less a leak that the last model shows without one because its pixels forget.
 
     Voltages that go back after each change send ON events after things darker than what is around them: a
-    high-pass of 0.6 Hz looked like a leak of 5.8 Hz beside a model without it. And where the light between
-    events tells of a drift, what the search has found since may do as much: a response that is linear in the
-    dark did, by 1.9 thresholds per second.
+    high-pass of 0.6 Hz looked like a leak of 5.8 Hz beside a model without it.
 
     Args:
         task: What the diagnosis is asked.
@@ -213,12 +211,11 @@ def settle_leak(
         measurement: Its light and its events are looked at.
         model: The last one.
     """
-    added = set(task.added_to(model)) - {LEAKING}
-    if not added:
+    if HighPass.name not in task.added_to(model):
         return seen
     sensor = model.sensor.without(LEAKING) if LEAKING in model.sensor else model.sensor
     gone = set()
-    if HighPass.name in added and seen.entry_of(LEAK_EVENTS) is not None:
+    if seen.entry_of(LEAK_EVENTS) is not None:
         found = _events_at_rest(task, measurement, sensor)
         gone |= {LEAK_EVENTS} - {found.name if found is not None else ""}
     if seen.entry_of(DRIFTING_MEMORY) is not None:

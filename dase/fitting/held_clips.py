@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from dase.events import Events
 from dase.fitting.delays_after_frames import delays_after_frames
 from dase.fitting.held_events import HeldEvents
-from dase.fitting.thresholds_of_frames import thresholds_of_frames
+from dase.fitting.thresholds_of_frames import spread_of_thresholds
 from dase.probes.stimulus import light_of
 from dase.scenes.scene import LOG_EPS, Scene
 from dase.scenes.video import VideoScene
@@ -152,8 +152,8 @@ def holds_frames(events: Events, scene: Scene, settings: HeldClipSettings = HELD
     pixel = events.y[chosen].astype(np.int64) * events.width + events.x[chosen]
     frame = np.searchsorted(times, t, side="right") - 1
     late, gap = t - times[frame], times[frame + 1] - times[frame]
-    parts = np.round(gap / np.maximum(late, 1e-9))
-    even = (parts <= settings.shares) & (np.abs(late * parts - gap) < 1.1e-6 * parts)
+    parts, exact = even_parts(late, gap)
+    even = exact & (parts <= settings.shares)
     at_frame = late < 0.6e-6
     if at_frame.mean() >= settings.exact or even.mean() >= settings.spread_out:
         return False
@@ -173,7 +173,7 @@ def holds_frames(events: Events, scene: Scene, settings: HeldClipSettings = HELD
     if begin is None or (spread and even[clear].mean() >= settings.at_parts):
         return False
     past = phase > settings.past
-    fine = (parts <= settings.many) & (np.abs(late * parts - gap) < 1.1e-6 * parts)
+    fine = exact & (parts <= settings.many)
     if not spread and past.any() and fine[past].mean() >= settings.all_at_parts:
         used = np.bincount(parts[past & fine].astype(np.int64)) / np.count_nonzero(past)
         if np.count_nonzero(used > settings.used) >= settings.kinds:
@@ -193,6 +193,34 @@ def holds_frames(events: Events, scene: Scene, settings: HeldClipSettings = HELD
     return after > settings.sooner * max(before, 0.0)
 
 
+def even_parts(
+    late: NDArray[np.float64], gap: NDArray[np.float64] | float
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Return the number of parts of a time of which events come at the end of one, and whether they just do.
+
+    Args:
+        late: Of each event since that time began [s], shape (N,).
+        gap: That time [s], shape (N,) or one for all.
+
+    Returns:
+        The nearest whole number, and whether the event is there to the microsecond, shape (N,) each.
+    """
+    parts = np.round(gap / np.maximum(late, 1e-9))
+    return parts, np.abs(late * parts - gap) < 1.1e-6 * parts
+
+
+def most_beside(phase: NDArray[np.float64], bins: int, beside: int) -> float:
+    """Return how many events at most lie in some bins beside each other of a turn.
+
+    Args:
+        phase: Of the events, in 0..1, shape (N,).
+        bins: Of the turn.
+        beside: Bins that are taken together.
+    """
+    counts = np.histogram(phase, bins, (0.0, 1.0))[0]
+    return float(np.convolve(np.concatenate([counts, counts]), np.ones(beside), "valid").max())
+
+
 def _come_by_their_way(
     events: Events, scene: VideoScene, phase: NDArray[np.float64], settings: HeldClipSettings
 ) -> bool:
@@ -204,16 +232,14 @@ def _come_by_their_way(
         phase: When they come after a frame, relative to the next, in 0..1, shape (N,).
         settings: How sure.
     """
-    counts = np.histogram(phase, settings.parts, (0.0, 1.0))[0]
-    near = np.convolve(np.concatenate([counts, counts]), np.ones(settings.quarter), "valid")
-    if near.max() < settings.dense * len(phase):
+    if most_beside(phase, settings.parts, settings.quarter) < settings.dense * len(phase):
         return False
     delays = delays_after_frames(events, scene)
     if delays is None or delays.width() > settings.width or delays.slope_in_errors() < settings.later:
         return False
     # what appears on a dark ground sends at the begin of a frame, too, and more of it the longer that lasts
-    found = thresholds_of_frames(HeldEvents.of(events, scene)).values()
-    return not found or float(np.mean([one.spread for one in found])) <= settings.apart_at_most
+    differ = spread_of_thresholds(HeldEvents.of(events, scene))
+    return not settings.apart_at_most < differ < np.inf
 
 
 def _begin_of_all(phase: NDArray[np.float64], settings: HeldClipSettings = HELD_CLIPS) -> float | None:

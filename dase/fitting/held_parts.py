@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 
 from dase.events import Events
 from dase.fitting.frame_steps import clip_step_of
+from dase.fitting.held_clips import even_parts, most_beside
 from dase.fitting.held_events import HeldEvents, rows_with_most_events
-from dase.fitting.thresholds_of_frames import thresholds_of_frames
+from dase.fitting.thresholds_of_frames import spread_of_thresholds
 from dase.scenes.scene import Scene
 from dase.scenes.video import VideoScene
 
@@ -97,12 +98,12 @@ def parts_that_are_held(events: Events, scene: Scene, settings: HeldPartSettings
     if not likely:
         return 0
     events, scene = _of_busiest_rows(events, scene, settings)
-    differ = {parts: _thresholds_differ(events, scene, parts, settings) for parts in likely}
+    differ = {parts: _thresholds_differ(events, scene, parts) for parts in likely}
     best = min(likely, key=differ.__getitem__)
     if differ[best] > settings.apart:
         return 0
     others = [n for n in range(1, settings.most + 1) if n not in likely]
-    differ |= {parts: _thresholds_differ(events, scene, parts, settings) for parts in others}
+    differ |= {parts: _thresholds_differ(events, scene, parts) for parts in others}
     next_best = min(value for parts, value in differ.items() if parts != best)
     return best if differ[best] <= settings.decided * next_best else 0
 
@@ -130,26 +131,16 @@ def _come_together(t: Array, step: float, settings: HeldPartSettings) -> bool:
         settings: How many more.
     """
     late = t % step
-    parts = np.round(step / np.maximum(late, 1e-9))
-    even = (parts <= settings.shares) & (np.abs(late * parts - step) < 1.1e-6 * parts)
+    parts, exact = even_parts(late, step)
+    even = exact & (parts <= settings.shares)
     late = late[(late > 0.6e-6) & (late < step - 0.6e-6)]
     if len(late) < settings.least or even.mean() >= settings.even:
         return False
     if np.bincount(np.round(1e6 * late).astype(np.int64)).max() > settings.at_once * len(late):
         return False  # a clock's ticks
-    counts = np.histogram(late / step, settings.bins, (0.0, 1.0))[0]
-    near = np.convolve(np.concatenate([counts, counts]), np.ones(settings.quarter), "valid")
-    return bool(near.max() >= settings.dense * len(late))
+    return most_beside(late / step, settings.bins, settings.quarter) >= settings.dense * len(late)
 
 
-def _thresholds_differ(events: Events, scene: VideoScene, parts: int, settings: HeldPartSettings) -> float:
-    """Return what thresholds differ by if so many pictures are held from frame to frame; inf where few tell.
-
-    Args:
-        events: Sorted.
-        scene: Their clip.
-        parts: Pictures.
-        settings: How much is looked at.
-    """
-    found = thresholds_of_frames(HeldEvents.of(events, scene.in_parts(parts)))
-    return float(np.mean([one.spread for one in found.values()])) if found else np.inf
+def _thresholds_differ(events: Events, scene: VideoScene, parts: int) -> float:
+    """Return what thresholds differ by if so many pictures per frame are held; inf where few tell."""
+    return spread_of_thresholds(HeldEvents.of(events, scene.in_parts(parts)))

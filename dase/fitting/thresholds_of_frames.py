@@ -107,6 +107,17 @@ def thresholds_of_frames(
     return out
 
 
+def spread_of_thresholds(seen: HeldEvents, *, wait: int = 1) -> float:
+    """Return by how much thresholds differ in the mean of ON and OFF events, relative; inf where few tell.
+
+    Args:
+        seen: Of pixels that take the light of a frame for their memory.
+        wait: Frames after an event whose light that is.
+    """
+    found = thresholds_of_frames(seen, wait=wait).values()
+    return float(np.mean([one.spread for one in found])) if found else np.inf
+
+
 def _normal_between(
     low: Array, high: Array, typical: float, settings: ThresholdSettings
 ) -> tuple[float, float]:

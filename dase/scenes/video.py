@@ -266,8 +266,9 @@ class VideoScene(Scene):
         light = to_light(self._frames[np.arange(len(self._times))], gamma=self.gamma)
         out = np.empty((parts * (len(light) - 1) + 1, *light.shape[1:]), np.float32)
         out[::parts] = light
+        change = np.diff(light, axis=0)
         for part in range(1, parts):
-            out[part::parts] = light[:-1] + np.float32(part / parts) * (light[1:] - light[:-1])
+            out[part::parts] = light[:-1] + np.float32(part / parts) * change
         inner = self._times[:-1, None] + np.diff(self._times)[:, None] * np.arange(parts) / parts
         return VideoScene(out, np.append(inner.ravel(), self._times[-1]))
 

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from dase.events import Events
 from dase.kernels import launch
-from dase.kernels.event_groups import count_busy_cells, measure_intervals, run_on_arrays
+from dase.kernels.event_groups import count_busy_cells, measure_intervals
 from dase.kernels.event_neighbours import mark_crowded
 
 
@@ -20,7 +20,7 @@ def row_major_pixels(events: Events) -> NDArray[np.int32]:
 def intervals_of_pixels(events: Events) -> NDArray[np.float64]:
     """Return the time since the event before of the same pixel [s], shape (N,); inf where there is none."""
     last, out = np.full(events.width * events.height, -np.inf), np.empty(len(events))
-    run_on_arrays(measure_intervals, events.t, row_major_pixels(events), last, out)
+    launch.run_on_arrays(measure_intervals, events.t, row_major_pixels(events), last, out)
     return out
 
 
@@ -105,7 +105,9 @@ class CalmShare:
     def push(self, events: Events) -> None:
         """Take events that follow those before."""
         where = events.t, events.x, events.y
-        run_on_arrays(count_busy_cells, *where, self._begin, self._span, self._side, self._newest, self._busy)
+        launch.run_on_arrays(
+            count_busy_cells, *where, self._begin, self._span, self._side, self._newest, self._busy
+        )
 
     def share(self, end: float) -> float:
         """Return the share of cells of space and time without an event, from begin to `end` [s]."""

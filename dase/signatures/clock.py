@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dase.events import Events
-from dase.kernels.event_groups import count_by_time_and_tile, run_on_arrays
+from dase.kernels import launch
+from dase.kernels.event_groups import count_by_time_and_tile
 
 
 @dataclass(frozen=True)
@@ -51,7 +52,7 @@ class ClockCounts:
             return
         self._make_room(int((part.t[-1] - self.begin) / step) + 1)
         columns = part.t, part.x, part.y, part.p
-        run_on_arrays(
+        launch.run_on_arrays(
             count_by_time_and_tile, *columns, self.begin, step, self._row, self._column, self._counts
         )
 

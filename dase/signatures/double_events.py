@@ -33,7 +33,7 @@ from scipy import stats
 from dase.events import Events
 from dase.formatting import format_count, format_percent, format_seconds
 from dase.kernels import launch
-from dase.kernels.event_groups import mark_times_of_many, run_on_arrays
+from dase.kernels.event_groups import mark_times_of_many
 from dase.kernels.event_neighbours import count_short_intervals
 from dase.signatures.calm_events import row_major_pixels
 from dase.signatures.chance import poisson_interval
@@ -181,7 +181,7 @@ def times_of_many(
         settings: What is a double event.
     """
     s, out = settings or DoubleSettings(), np.empty(len(t), np.bool_)
-    run_on_arrays(mark_times_of_many, t, s.tie, s.far, s.shared, out)
+    launch.run_on_arrays(mark_times_of_many, t, s.tie, s.far, s.shared, out)
     return out[asked]
 
 

@@ -16,12 +16,12 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from dase.events import Events
+from dase.kernels import launch
 from dase.kernels.event_groups import (
     count_line_pairs,
     mark_with_neighbours,
     measure_own_gaps,
     order_within_stamps,
-    run_on_arrays,
 )
 from dase.signatures.calm_events import row_major_pixels
 from dase.signatures.chance import ratio_interval, sign_flip_tail
@@ -118,7 +118,7 @@ def _shuffled_within_stamps(t: NDArray[np.float64], random: np.random.Generator)
     shared = order[np.append(alike, False) | np.append(False, alike)]
     first = np.maximum.accumulate(np.where(np.append(False, alike), 0, order))
     drawn = shared[np.argsort(draws[shared])]
-    run_on_arrays(order_within_stamps, first, drawn, order.copy(), order)
+    launch.run_on_arrays(order_within_stamps, first, drawn, order.copy(), order)
     return order
 
 
@@ -153,11 +153,11 @@ def _may_be_of_an_edge(
         settings: How near is beside; the longest time.
     """
     s, gaps, out = settings, np.empty(len(t)), np.zeros(len(t), np.int32)
-    run_on_arrays(measure_own_gaps, t, place, s.span, np.full(shape, -1, np.int32), gaps)
+    launch.run_on_arrays(measure_own_gaps, t, place, s.span, np.full(shape, -1, np.int32), gaps)
     for sign in (1, -1):
         seen = np.full([side + 2 * s.away for side in shape], -1, np.int32)
         # at least as far as the events with which successive ones are compared, and all of one stamp
-        run_on_arrays(mark_with_neighbours, t, place, gaps, s.lags[-1], s.away, sign, seen, out)
+        launch.run_on_arrays(mark_with_neighbours, t, place, gaps, s.lags[-1], s.away, sign, seen, out)
     return out
 
 
@@ -184,7 +184,7 @@ def _count_pairs(
     s, lags = settings, np.array((1, *settings.lags), np.int32)
     free = np.zeros((len(begins) - 1, 2, len(lags)), np.int32)
     pairs = np.zeros((*free.shape, 2), np.int32)
-    run_on_arrays(
+    launch.run_on_arrays(
         count_line_pairs, t, place, of_an_edge, begins, lags, s.span, s.beside, s.away, free, pairs,
         dim=(len(begins) - 1, len(lags)),
     )  # fmt: skip
