@@ -11,9 +11,9 @@ from helpers.frame_simulator import HEIGHT, WIDTH, counted_between_frames, shake
 from helpers.own_effects import effect_that_makes
 
 import dase
-from dase.diagnosis.drifting_memory import DRIFT, Drift, find_drifting_memory
+from dase.diagnosis.drifting_memory import DRIFT, Drift, drift_of, find_drifting_memory
 from dase.diagnosis.events_at_rest import find_events_at_rest
-from dase.diagnosis.light_between_events import LightBetweenEvents
+from dase.diagnosis.light_between_events import LightBetweenEvents, LightSteps
 from dase.diagnosis.seen_beside_model import _look_at_thresholds
 from dase.diagnosis.seen_effects import SeenEffects
 from dase.effects import EFFECTS
@@ -89,14 +89,35 @@ def test_a_model_that_drifts_by_itself_says_it_is_no_leak(scene, monkeypatch):
 
 
 def test_what_saturates_or_is_slow_or_uncertain_is_no_drift():
-    drift = Drift(rate=0.8, error=0.05, goes=0.4, from_none=0.75, bins=8)
+    drift = Drift(rate=0.8, error=0.05, goes=0.4, from_none=0.75, bins=8, alike=0.8)
     assert drift.is_leak(DRIFT)
     assert replace(drift, rate=2.0, from_none=2.0, goes=0.1).is_leak(DRIFT)
     assert not replace(drift, from_none=0.1).is_leak(DRIFT)
     assert not replace(drift, goes=0.2).is_leak(DRIFT)
     assert not replace(drift, error=0.2).is_leak(DRIFT)
     assert not replace(drift, bins=3).is_leak(DRIFT)
+    assert not replace(drift, alike=0.3).is_leak(DRIFT)
     assert not replace(drift, rate=0.3, from_none=0.3).is_leak(DRIFT)
+
+
+@pytest.mark.parametrize("leak", [0.0, 1.0])
+def test_long_waits_that_end_in_a_turn_are_no_drift(leak):
+    """Behind a pole light that has turned goes farther, OFF more than ON, and few events of long waits follow
+    one of their polarity."""
+    rng = np.random.default_rng(0)
+    many = 60_000
+    gap = np.exp(rng.uniform(np.log(0.007), np.log(0.9), many))
+    on = rng.random(many) < 0.5
+    again = rng.random(many) < 0.95 - gap
+    turned = np.where(again, 0.0, np.where(on, -0.4, 0.9))
+    sign = np.where(on, 1, -1)
+    change = sign * 0.2 * (1 + turned - sign * leak * gap + 0.1 * rng.standard_normal(many))
+    zeros = np.zeros(many)
+    steps = LightSteps(rng.integers(0, 6400, many), change, gap, zeros, zeros, on, again, np.ones(many, bool))
+    drift = drift_of(steps, 80)
+    assert drift.rate > DRIFT.rate
+    assert drift.is_leak(DRIFT) == (leak > 0)
+    assert drift.alike == pytest.approx(leak, abs=0.15)
 
 
 @pytest.mark.parametrize("step", [2.58e-4, 9e-4])
