@@ -41,7 +41,10 @@ class Linlog(Effect):
         "Hu, Liu, Delbruck: v2e, from video frames to realistic DVS events, 2021 (lin-log mapping)"
     )
     stages: ClassVar = {"respond": linlog_voltage}
-    signatures: ClassVar = (Makes("larger steps in the dark", tells=True, by="knee", absence=False),)
+    signatures: ClassVar = (
+        Makes("larger steps in the dark", tells=True, by="knee", absence=False),
+        Makes("kinked response", tells=True, absence=False),
+    )
     screen_limits: ClassVar = {
         "": "the knee wants light far below a screen's black: a lamp and grey filters over four decades",
     }

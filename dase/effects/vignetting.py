@@ -9,6 +9,7 @@ from typing import ClassVar
 import warp as wp
 
 from dase.effects.base import Effect, parameter
+from dase.effects.made_signatures import Makes
 
 
 @wp.func
@@ -34,7 +35,7 @@ class Vignetting(Effect):
     name: ClassVar[str] = "vignetting"
     source: ClassVar[str] = "Goldman, Chen: Vignette and exposure calibration and compensation, 2005"
     stages: ClassVar = {"light": vignetted_light}
-    signatures: ClassVar = ()
+    signatures: ClassVar = (Makes("kink at the corners", tells=True, absence=False),)
     screen_limits: ClassVar = {
         "": (
             "vignetting cannot be told from a screen that is darker at its corners: an evenly lit sheet "

@@ -57,6 +57,8 @@ class SimulationStream(Enum):
     """Events of a model at pixels that seem to be hot."""
     STEPS_IN_THE_DARK = (2900, 0)
     """Events of a model whose response is the logarithm of light alone."""
+    KINKED_RESPONSE = (3100, 0)
+    """Events of a model whose response has no kink."""
     STIMULUS = (0, 1000)
     """Standard recordings; a turn is a stimulus."""
     RECORDING = (1, 500_000)

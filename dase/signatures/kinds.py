@@ -24,6 +24,8 @@ DRIFTING_MEMORY = "drifting memory"
 REDRAWN_THRESHOLDS = "redrawn thresholds"
 LATE_EVENTS = "late events"
 LARGER_STEPS_IN_THE_DARK = "larger steps in the dark"
+KINKED_RESPONSE = "kinked response"
+KINK_AT_CORNERS = "kink at the corners"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -122,6 +124,18 @@ KINDS: dict[str, SignatureKind] = {
             name=LARGER_STEPS_IN_THE_DARK,
             about="the darker it is, the farther light goes between two events",
             ways=("current", "knee"),
+            beside_model=True,
+            whatever_fits=True,
+        ),
+        SignatureKind(
+            name=KINKED_RESPONSE,
+            about="below a grey light goes far less far between two events, as by the response of v2e",
+            beside_model=True,
+            whatever_fits=True,
+        ),
+        SignatureKind(
+            name=KINK_AT_CORNERS,
+            about="that grey lies at more light of the scene the nearer a corner is",
             beside_model=True,
             whatever_fits=True,
         ),
