@@ -112,6 +112,19 @@ class HeldClipSettings:
     used: float = 0.02
     """Share of those events that are of one, from which on it counts."""
 
+    grids: int = 40
+    """Parts of a frame, at most, at all of which a simulator that knows frames alone puts its events, as many
+    as the busiest pixel sends."""
+
+    on_grid: float = 0.9
+    """Share of the events of a frame that are at such parts, from which on they are."""
+
+    of_frames: float = 0.7
+    """Share of the frames with events at parts of their own, from which on nothing is held."""
+
+    of_frame: int = 10
+    """Events that are looked at of a frame that counts, at least."""
+
     tick: float = 0.02
     """Of a frame before its end: rounded stamps of the next frame's time."""
 
@@ -157,6 +170,8 @@ def holds_frames(events: Events, scene: Scene, settings: HeldClipSettings = HELD
     at_frame = late < 0.6e-6
     if at_frame.mean() >= settings.exact or even.mean() >= settings.spread_out:
         return False
+    if come_at_even_parts(frame, late, gap, settings):
+        return False
     phase = late / gap
     begin, spread = begin_of_events(phase % 1.0, settings)
     lies_apart = begin is None
@@ -191,6 +206,40 @@ def holds_frames(events: Events, scene: Scene, settings: HeldClipSettings = HELD
         ways = np.clip(ways, -settings.change, settings.change)[place] * np.where(p[here], 1, -1)[:, None]
         before, after = before + float(ways[:, 0].sum()), after + float(ways[:, 1].sum())
     return after > settings.sooner * max(before, 0.0)
+
+
+def come_at_even_parts(
+    frame: NDArray[np.int64],
+    late: NDArray[np.float64],
+    gap: NDArray[np.float64] | float,
+    settings: HeldClipSettings = HELD_CLIPS,
+) -> bool:
+    """Return whether events come at even parts of the time to the next frame, of each frame as many.
+
+    So v2e stamps them, by how many the busiest pixel sends. A clock's ticks are as many in all frames, and
+    what is held comes at one of such parts.
+
+    Args:
+        frame: After which each event comes, shape (N,).
+        late: How long after it [s], shape (N,).
+        gap: To the next frame [s], shape (N,) or one for all.
+        settings: How many parts there may be.
+    """
+    many = np.bincount(frame)
+    asked = many >= settings.of_frame
+    if not asked.any():
+        return False
+    share, of_all = np.zeros(len(many)), 0.0
+    for parts in range(2, settings.grids + 1):
+        place = late * parts / gap
+        nearest = np.round(place)
+        at_one = np.abs(place - nearest) * gap < 0.6e-6 * parts
+        usual = np.bincount(frame, at_one & (nearest == np.median(nearest)), len(many))
+        here = np.bincount(frame, at_one, len(many))
+        of_all = max(of_all, float(at_one.mean()))
+        share = np.maximum(share, np.where(usual < settings.on_grid * here, here / np.maximum(many, 1), 0.0))
+    own_parts = float(np.mean(share[asked] >= settings.on_grid))
+    return of_all < settings.on_grid and own_parts >= settings.of_frames
 
 
 def even_parts(

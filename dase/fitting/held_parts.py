@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from dase.events import Events
 from dase.fitting.frame_steps import clip_step_of
-from dase.fitting.held_clips import even_parts, most_beside
+from dase.fitting.held_clips import come_at_even_parts, even_parts, most_beside
 from dase.fitting.held_events import HeldEvents, rows_with_most_events
 from dase.fitting.thresholds_of_frames import spread_of_thresholds
 from dase.scenes.scene import Scene
@@ -94,6 +94,9 @@ def parts_that_are_held(events: Events, scene: Scene, settings: HeldPartSettings
     t = events.t[inside][:: max(1, many // settings.events)]
     room = settings.room // (len(times) * scene.width * scene.height)
     numbers = range(2, min(settings.most, room) + 1)
+    at = np.floor((t - times[0]) / step)
+    if come_at_even_parts(at.astype(np.int64), t - times[0] - at * step, step):
+        return 0
     likely = [n for n in numbers if _come_together(t - times[0], step / n, settings)]
     if not likely:
         return 0

@@ -10,7 +10,7 @@ import dase
 from dase.effects import EFFECTS
 from dase.effects.threshold import Threshold
 from dase.events import Events
-from dase.fitting.held_clips import holds_frames
+from dase.fitting.held_clips import come_at_even_parts, holds_frames
 from dase.fitting.measurement import as_measurement
 from dase.scenes.video import VideoScene
 from dase.simulation.sensor import Sensor
@@ -157,3 +157,24 @@ def test_noise_that_is_drawn_at_each_frame_is_not_early(scene):
     order = np.argsort(t, kind="stable")
     both = Events(t[order], x[order], y[order], p[order], WIDTH, HEIGHT)
     assert not holds_frames(both, scene)
+
+
+@pytest.mark.parametrize(
+    ("places", "is_so"),
+    [
+        ("parts of their own", True), ("ticks", False), ("one part", False), ("any time", False),
+        ("few", False),
+    ],
+)  # fmt: skip
+def test_even_parts_of_which_each_frame_has_its_own_number_are_of_frames(places, is_so):
+    """v2e puts the n events of its busiest pixel at n parts: 179, 357 ... us of one frame, 147, 294 ... of
+    the next. As held pictures these had a latency, certain and wrong."""
+    rng = np.random.default_rng(0)
+    frame = np.sort(rng.integers(0, 40, 2000 if places != "few" else 200))
+    parts = 12 + frame % 6 if places != "ticks" else np.full(len(frame), 25)
+    part = np.minimum(rng.geometric(0.4, len(frame)), parts - 1)
+    late = part / parts if places != "one part" else 1 / parts
+    late = rng.uniform(size=len(frame)) if places == "any time" else late
+    stamped = np.floor(1e6 * 2.5e-3 * late + 0.5) / 1e6
+    assert come_at_even_parts(frame, stamped, 2.5e-3) == is_so
+    assert come_at_even_parts(frame, stamped, np.full(len(frame), 2.5e-3)) == is_so
