@@ -25,6 +25,7 @@ from dase.diagnosis.state import DiagnosisTask, with_same_freedom
 from dase.effects.jitter import Jitter
 from dase.errors import InputError
 from dase.fitting.frame_steps import is_held
+from dase.fitting.held_parts import come_together_at_pictures
 from dase.fitting.measurement import Measurement
 from dase.fitting.model import FittedModel, refit_model, with_fixed_effect
 from dase.formatting import format_percent
@@ -236,6 +237,8 @@ def find_jitter_beside(
     """
     right = reaches_floor(judgement)
     if not right and (noise or judgement.error > REDRAWN.far):
+        return None
+    if come_together_at_pictures(measurement.compared_events(), measurement.scene):
         return None
     light = LightBetweenEvents.of(measurement, log_eps=model.sensor.log_eps)
     if light is None:

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from helpers.frame_simulator import shaken_texture
 from helpers.held_pixels import held_with_low_pass
+from helpers.sensors import sensor_with
 
 import dase
-from dase.fitting.held_parts import parts_that_are_held
+from dase.fitting.held_parts import HELD_PARTS, come_together_at_pictures, parts_that_are_held
 from dase.fitting.measurement import as_measurement
+from dase.scenes.static import StaticScene
 from dase.scenes.video import VideoScene
 
 GAP = 4e-3
@@ -47,6 +51,20 @@ def test_light_that_goes_straight_is_not_held(clip):
     # by a slow clock, too
     clock = dase.Sensor().with_effect(dase.EFFECTS["timestamp"](step=1e-3))
     assert parts_that_are_held(dase.simulate(clip, clock), clip) == 0
+
+
+@pytest.mark.parametrize("parts", [1, 2, 4])
+def test_events_of_held_pictures_come_together(clip, parts):
+    shown = clip.in_parts(parts) if parts > 1 else clip
+    events = held_with_low_pass(shown, cutoff=2e4, late=8e-5, stamps=1e-5, threshold=0.1)
+    assert come_together_at_pictures(events, clip)
+    assert not come_together_at_pictures(events, clip, replace(HELD_PARTS, least=len(events) + 1))
+    assert not come_together_at_pictures(events, StaticScene(72, 48, duration=0.4))
+
+
+def test_events_of_light_that_goes_straight_come_at_any_time(clip):
+    for more in ({}, {"jitter": {"spread": 0.2}}, {"latency": {"delay": 1e-3}}):
+        assert not come_together_at_pictures(dase.simulate(clip, sensor_with(**more), seed=2), clip)
 
 
 def test_frames_that_are_held_are_of_one_part(clip):
