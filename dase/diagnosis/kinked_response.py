@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from dase.diagnosis.light_between_events import LightBetweenEvents, LightSteps, StepSettings
 from dase.effects.linlog import Linlog
-from dase.effects.vignetting import Vignetting
+from dase.effects.vignetting import Vignetting, square_from_middle
 from dase.errors import InputError
 from dase.fitting.frame_steps import is_held
 from dase.fitting.measurement import Measurement
@@ -113,24 +113,23 @@ class _Steps:
         before: Log intensity at the earlier event, shape (N,).
         after: The same at the later one.
         sign: 1 of ON events, -1 of OFF events.
-        off: Square of the distance of the pixel from the middle, relative to that of a corner, shape (N,).
+        square: Of the distance of the pixel from the middle, in units of the corner's, shape (N,).
     """
 
     before: Array
     after: Array
     sign: int
-    off: Array
+    square: Array
 
     def darker_by(self, loss: float) -> _Steps:
         """Return the steps of light that is less towards the corners, see `Vignetting`."""
-        tangent = (1.0 / math.sqrt(1.0 - loss) - 1.0) * self.off
-        less = -2.0 * np.log1p(tangent)
-        return _Steps(self.before + less, self.after + less, self.sign, self.off)
+        less = np.log(Vignetting(loss=loss).light_at(self.square))
+        return _Steps(self.before + less, self.after + less, self.sign, self.square)
 
     def thinned(self, most: float) -> _Steps:
         """Return so many of them at most, spread evenly."""
         every = slice(None, None, max(1, math.ceil(len(self.after) / most)))
-        return _Steps(self.before[every], self.after[every], self.sign, self.off[every])
+        return _Steps(self.before[every], self.after[every], self.sign, self.square[every])
 
 
 @dataclass(frozen=True)
@@ -141,13 +140,11 @@ class _Kink:
     dark, so that medians are not those of smooth light, and dead times and noise move means.
 
     Args:
-        knee: Grey of the kink.
         loss: Of light in the corners.
         differ: Standard deviation of the logarithms; 0 where too few steps tell.
         left: Share of that which the line leaves, of the polarity of which it leaves more.
     """
 
-    knee: float
     loss: float
     differ: float
     left: float
@@ -261,25 +258,22 @@ def _kinks_of(
         settings: Which steps count.
         most: Of either polarity.
     """
-    height, width = light.measurement.scene.height, light.measurement.scene.width
-    row, column = np.divmod(steps.pixel, width)
-    row = row + light.rows[0]
-    middle = 0.5 * (height - 1), 0.5 * (width - 1)
-    off = ((row - middle[0]) ** 2 + (column - middle[1]) ** 2) / (middle[0] ** 2 + middle[1] ** 2)
+    scene = light.measurement.scene
+    row, column = np.divmod(steps.pixel, scene.width)
+    square = square_from_middle(column, row + light.rows[0], scene.width, scene.height)
     counts = steps.counts & steps.again & (steps.gap < settings.longest)
     both, share = [], 1.0
     for sign in (1, -1):
         mine = counts & (steps.on == (sign > 0))
         after = steps.level[mine]
-        whole = _Steps(after - steps.change[mine], after, sign, off[mine])
+        whole = _Steps(after - steps.change[mine], after, sign, square[mine])
         both.append(whole.thinned(most))
         share = min(share, len(both[-1].after) / max(len(after), 1))
-
     few = replace(settings, steps=share * settings.steps, of_level=max(20.0, share * settings.of_level))
 
     def kink(knee: float, loss: float) -> _Kink:
         told = [_Levels.of(one.darker_by(loss) if loss else one, knee, log_eps, few) for one in both]
-        out = _Kink(knee, loss, 0.0, math.inf)
+        out = _Kink(loss, 0.0, math.inf)
         if sum(one.dark for one in told) < few.steps:
             return out
         for way in range(2):
@@ -287,7 +281,7 @@ def _kinks_of(
             if differ < settings.differ:
                 continue
             left = max(one.left[way] / one.differ[way] for one in told)
-            out = min(out, _Kink(knee, loss, differ, left), key=lambda one: one.left)
+            out = min(out, _Kink(loss, differ, left), key=lambda one: one.left)
         return out
 
     return kink

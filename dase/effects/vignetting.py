@@ -6,10 +6,29 @@ import math
 from dataclasses import dataclass
 from typing import ClassVar
 
+import numpy as np
 import warp as wp
+from numpy.typing import ArrayLike, NDArray
 
 from dase.effects.base import Effect, parameter
 from dase.effects.made_signatures import Makes
+
+Array = NDArray[np.float64]
+
+
+def square_from_middle(x: ArrayLike, y: ArrayLike, width: int, height: int) -> Array:
+    """Return the square distance of pixels from the middle, in units of that of a corner's pixel, shape (N,).
+
+    Args:
+        x: Columns, shape (N,).
+        y: Rows, shape (N,).
+        width: Columns of the sensor.
+        height: Rows of it.
+    """
+    middle_x, middle_y = 0.5 * (width - 1), 0.5 * (height - 1)
+    square = (np.asarray(x) - middle_x) ** 2 + (np.asarray(y) - middle_y) ** 2
+    out: Array = square / max(middle_x**2 + middle_y**2, 1.0)
+    return out
 
 
 @wp.func
@@ -57,6 +76,16 @@ class Vignetting(Effect):
 
         It depends on the picture which of them send the most events in the dark.
         """
-        tangent = 1.0 / math.sqrt(max(1.0 - self.loss, 1e-12)) - 1.0
         # of a rectangle these are a third and about half of the corner's, whatever its sides
-        return (1.0 + tangent / 3.0) ** -2.0, (1.0 + tangent / 2.0) ** -2.0
+        whole, outer = self.light_at(np.array([1 / 3, 1 / 2]))
+        return float(whole), float(outer)
+
+    def light_at(self, square: Array) -> Array:
+        """Return the share of the light that is left, shape (N,).
+
+        Args:
+            square: Of the distance from the middle, in units of the corner's, see `square_from_middle`.
+        """
+        tangent = 1.0 / math.sqrt(max(1.0 - self.loss, 1e-12)) - 1.0
+        out: Array = (1.0 + tangent * square) ** -2.0
+        return out

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from dase.effects.vignetting import square_from_middle
 from dase.events import Events
 from dase.fitting.held_events import HeldEvents
 from dase.scenes.video import VideoScene
@@ -273,9 +274,6 @@ def delays_after_frames(
         return None
     used = np.concatenate(chosen)
     row = seen.row[first[used]]
-    x = pixel[used] % scene.width - 0.5 * (scene.width - 1)
-    y = row - 0.5 * (scene.height - 1)
-    corner = (0.5 * (scene.width - 1)) ** 2 + (0.5 * (scene.height - 1)) ** 2
-    square = (x**2 + y**2) / max(corner, 1.0)
+    square = square_from_middle(pixel[used] % scene.width, row, scene.width, scene.height)
     group = row // settings.rows % settings.blocks
     return DelaysAfterFrames(np.concatenate(ways), seen.late[first[used]], now[used], seen.gap, group, square)

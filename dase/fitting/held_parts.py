@@ -98,11 +98,9 @@ def parts_that_are_held(events: Events, scene: Scene, settings: HeldPartSettings
     t = events.t[inside][:: max(1, many // settings.events)]
     room = settings.room // (len(times) * scene.width * scene.height)
     numbers = range(2, min(settings.most, room) + 1)
-    at = np.floor((t - times[0]) / step)
-    if come_at_even_parts(at.astype(np.int64), t - times[0] - at * step, step):
-        return 0
     likely = [n for n in numbers if _come_together(t - times[0], step / n, settings)]
-    if not likely:
+    at = np.floor((t - times[0]) / step)
+    if not likely or come_at_even_parts(at.astype(np.int64), t - times[0] - at * step, step):
         return 0
     events, scene = _of_busiest_rows(events, scene, settings)
     differ = {parts: _thresholds_differ(events, scene, parts) for parts in likely}
