@@ -27,7 +27,7 @@ from dase.diagnosis.held_frames import (
     with_frame_as_memory,
     with_longer_dead_time,
 )
-from dase.diagnosis.kinked_response import PARAMETER_OF_KINK, effects_of_kink, find_kinked_response
+from dase.diagnosis.kink_in_model import put_kink_in_model
 from dase.diagnosis.lamp_in_part import LampInPart, find_lamp_in_part
 from dase.diagnosis.mostly_bursts import bursts_of_all_events, with_bursts_of_all_events
 from dase.diagnosis.seen_beside_model import (
@@ -51,7 +51,6 @@ from dase.diagnosis.steps_in_the_dark import EFFECT_OF_WAY
 from dase.diagnosis.unequal_thresholds import EFFECT as MISMATCH
 from dase.effects import EFFECTS, Effect
 from dase.effects.jitter import Jitter
-from dase.effects.linlog import Linlog
 from dase.effects.made_signatures import makers_of, told_by
 from dase.effects.optics_blur import OpticsBlur
 from dase.fitting.burst_strength import BurstStrength, put_in_step
@@ -62,7 +61,6 @@ from dase.fitting.model import (
     fit_present_model,
     free_where_measured,
     model_of,
-    refit_model,
     with_fixed_effect,
 )
 from dase.fitting.parameter_space import axes_of, refuse_idle
@@ -79,7 +77,6 @@ from dase.signatures.kinds import (
     OPPOSITE_PAIRS,
     UNEQUAL_THRESHOLDS,
 )
-from dase.signatures.result import Signature
 from dase.simulation.sensor import Sensor
 from dase.simulation.sensor_file import as_sensor
 
@@ -164,7 +161,7 @@ def diagnose(
     shown = held_behind_low_pass(measurement, state.task.evidence, start, compared.split, seed=seed)
     if shown is not None:
         return replace(again(shown), seconds=time.perf_counter() - begin)
-    start, kink = _with_kink(state, compared, start)
+    start, kink = put_kink_in_model(state, compared, start)
     part = part_to_simulate(measurement, state.task.evidence.when)
     in_step = state.task.evidence.frame_step > 0
     seen = without_the_scene(compared.seen, part, start.sensor, seed, in_step=in_step)
@@ -176,7 +173,9 @@ def diagnose(
         state.doubt_scene(with_scene_doubt(state.task.evidence, compared.guessed, start, seed=seed))
         before = _error_as_given(state.task, given, free)
         start = _fitted_unless_worse(state, start.sensor, free)
-    seen = look_beside_model(state, replace(seen, entries=(*seen.entries, *kink)), measurement, start)
+    if kink is not None:
+        seen = replace(seen, entries=(*seen.entries, *kink.seen))
+    seen = look_beside_model(state, seen, measurement, start)
     state.notes += compared.notes
     start, strength = _with_bursts(state, compared, seen, start)
     if so_far is not None:
@@ -191,6 +190,8 @@ def diagnose(
     seen = settle_doubles(state.task, seen, model)
     seen = settle_leak(state.task, seen, measurement, model)
     found = conclude_diagnosis(state, start, model, before, seen, names, measurement)
+    if kink is not None:
+        found = kink.added_to(found, state.task)
     found = _with_what_pixels_show(found, state.task, compared, seen, model, strength)
     if measurement.lens is not None:
         found = with_blurred_lens(found, state.task, compared, start, model)
@@ -291,31 +292,6 @@ def _fitted_unless_worse(state: DiagnosisState, given: Sensor, free: Sequence[st
     return asked
 
 
-def _with_kink(
-    state: DiagnosisState, compared: ComparedMeasurement, model: FittedModel
-) -> tuple[FittedModel, tuple[Signature, ...]]:
-    """Return a model with the kink of its response that events show, fitted, and what shows it.
-
-    It is a simulator's own, known to the last digit, and hides what else steps in the dark would tell.
-
-    Args:
-        state: Counts it among what the model has before the search.
-        compared: The measurement, and what its events show.
-        model: The one before the search.
-    """
-    task = state.task
-    if task.evidence.contradiction or compared.seen.lamp or Linlog.name in task.given:
-        return model, ()
-    found = find_kinked_response(compared.measurement, model.sensor, seed=task.seed)
-    mine = [one for one in effects_of_kink(found) if one.name in task.effects]
-    if not mine:
-        return model, ()
-    for effect in mine:
-        state.count_as_given(effect.name)
-        model = with_fixed_effect(model, effect)
-    return refit_model(task.evidence, model, seed=task.seed), found
-
-
 def _with_bursts(
     state: DiagnosisState, compared: ComparedMeasurement, seen: SeenEffects, model: FittedModel
 ) -> tuple[FittedModel, BurstStrength | None]:
@@ -365,10 +341,6 @@ def _with_what_pixels_show(
     for way, (effect, parameter) in EFFECT_OF_WAY.items():
         if darker is not None and way in darker.details and effect in task.effects:
             found = with_size_that_was_seen(found, darker, f"{effect}.{parameter}")
-    for name, parameter in PARAMETER_OF_KINK.items():
-        told = seen.entry_of(name)
-        if told is not None and parameter.partition(".")[0] in task.effects:
-            found = with_size_that_was_seen(found, told, parameter)
     silent = compared.silent
     if silent is not None and silent.decides and not contradicted:
         silent = without_the_explained_silence(silent, measurement, model.sensor, seed=task.seed)

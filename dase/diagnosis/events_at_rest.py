@@ -132,6 +132,10 @@ class EventsAtRestSettings:
     sure: float = 5.0
     """The same, in its standard errors."""
 
+    grows: float = 3.0
+    """Times as often as the darker pixels the brighter ones send what no shot noise is, at least: that is
+    rarer in bright light, or as frequent."""
+
     by_chance: float = 0.1
     """How far from the share of independent polarities that of shot noise is, at most: it was 0.02."""
 
@@ -147,11 +151,13 @@ class Rests:
         pixels: Row-major indices of those that rest long enough, shape (K,).
         begin: From when on their events count [s], shape (K,).
         end: Until when [s], shape (K,).
+        level: Of their light then [log intensity], shape (K,).
     """
 
     pixels: NDArray[np.int32]
     begin: Array
     end: Array
+    level: Array
 
     @property
     def seconds(self) -> float:
@@ -172,7 +178,7 @@ class Rests:
         begin = maximum_filter(begin.reshape(height, width), size).reshape(-1)[self.pixels]
         end = minimum_filter(end.reshape(height, width), size).reshape(-1)[self.pixels]
         kept = begin < end
-        return Rests(self.pixels[kept], begin[kept], end[kept])
+        return Rests(self.pixels[kept], begin[kept], end[kept], self.level[kept])
 
     def events_in(
         self, events: Events
@@ -217,7 +223,7 @@ def find_rests(
     size = scene.width * scene.height
     pixels = np.arange(size, dtype=np.int32)
     if len(times) < 2:
-        return Rests(pixels[:0], np.empty(0), np.empty(0))
+        return Rests(pixels[:0], *np.empty((3, 0)))
     if size * len(times) > settings.samples:
         count = max(1, settings.samples // len(times))
         draw = Draw.PIXELS_OF_RESTS.generator(seed)
@@ -227,7 +233,8 @@ def find_rests(
     # noise of the voltage is new to a memory at the first sample, too
     begin, end = times[first] + settings.settle, times[last] - settings.lead
     long = times[last] - times[first] >= settings.least
-    return Rests(pixels[long], begin[long], end[long])
+    at_rest = level[first, np.arange(len(pixels))].astype(np.float64)
+    return Rests(pixels[long], begin[long], end[long], at_rest[long])
 
 
 def longest_rest(
@@ -381,6 +388,10 @@ def judge_events_at_rest(
         if way:
             details[way] = share
             words += f"; {why}"
+        times = _growth_with_light(p, at, rests, settings)
+        if times >= settings.grows:
+            details["doubtful"] = True
+            words += f"; bright pixels send {times:.2g} times as many as dark ones, which no shot noise does"
     elif off <= settings.one:
         if not _goes_on_inside(rests, events, rate, settings):
             return None
@@ -464,6 +475,33 @@ def _way_of_noise(
     if abs(opposite - 2 * on * (1 - on)) <= settings.by_chance:
         return "independent", opposite, words
     return "", opposite, ""
+
+
+def _growth_with_light(
+    p: NDArray[np.bool_], at: NDArray[np.int64], rests: Rests, settings: EventsAtRestSettings
+) -> float:
+    """Return how many times as often as the darker ones the brighter pixels send, at least; 0 where few do.
+
+    Of the rarer polarity: a leak beside the noise is of one, and grows with light.
+
+    Args:
+        p: Whether each event is ON, shape (N,).
+        at: Which pixel sent it, shape (N,).
+        rests: Of the pixels.
+        settings: How many tell.
+    """
+    rarer = p if 2 * np.count_nonzero(p) <= len(p) else ~p
+    length = rests.end - rests.begin
+    order = np.argsort(rests.level, kind="stable")
+    # of pixels of one level no half is darker
+    middle = rests.level[order[np.searchsorted(np.cumsum(length[order]), 0.5 * rests.seconds)]]
+    bright, dark = rests.level > middle, rests.level < middle
+    sent = np.bincount(at[rarer], minlength=len(length))
+    many, few = int(sent[bright].sum()), int(sent[dark].sum())
+    if many < settings.events or min(length[bright].sum(), length[dark].sum()) < 0.2 * rests.seconds:
+        return 0.0
+    least = poisson_interval(many)[0] / length[bright].sum()
+    return float(least / (poisson_interval(few)[1] / length[dark].sum()))
 
 
 def _sent_by_hot_pixels(

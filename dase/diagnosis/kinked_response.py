@@ -12,7 +12,7 @@ That tells a loss of light there, which nothing else shows where pixels see the 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -37,13 +37,6 @@ KNEE = 20 / 255
 
 LOOKED_AT = StepSettings(darkest=0.005, samples=8_000_000, events=300_000)
 """Pixels, instants and events; nearly all light, for the kink is in the dark."""
-
-
-PARAMETER_OF_KINK = {
-    KINKED_RESPONSE: f"{Linlog.name}.knee",
-    KINK_AT_CORNERS: f"{Vignetting.name}.loss",
-}
-"""Signature to the parameter that it tells, with its effect."""
 
 
 @dataclass(frozen=True)
@@ -208,17 +201,6 @@ def find_kinked_response(
     if is_uneven and Vignetting.name not in sensor:
         out.append(_at_corners(best, even, settings))
     return tuple(out)
-
-
-def effects_of_kink(found: Sequence[Signature]) -> list[Linlog | Vignetting]:
-    """Return the effects that make a kink that was found."""
-    out = list[Linlog | Vignetting]()
-    for one in found:
-        if one.name == KINKED_RESPONSE:
-            out.append(Linlog(knee=one.size, slope=math.log(255 * one.size)))
-        elif one.name == KINK_AT_CORNERS:
-            out.append(Vignetting(loss=one.size))
-    return out
 
 
 def _least(kink_of: Callable[[float, float], _Kink], losses: Array) -> _Kink:

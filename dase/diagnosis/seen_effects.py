@@ -204,8 +204,8 @@ class SeenEffects:
         out = []
         two_poles = self._two_poles_for_pole_and_delay(graded)
         for one in graded:
-            if one.effect in self._noise and one.grade is Grade.STAND_IN:
-                # noise that comes so is there, but the model with it is another's
+            if one.effect in self._noise and (one.grade is Grade.STAND_IN or one.effect in self._doubtful):
+                # noise that comes so is there, but the model with it is another's, or no light makes it so
                 one = replace(one, grade=Grade.EITHER, unknown=True, seen=seen[one.effect])
             elif one.grade is Grade.SUPPORTED and self._is_in_doubt(one):
                 one = replace(one, grade=Grade.EITHER, unknown=True)
@@ -310,6 +310,12 @@ class SeenEffects:
     def _noise(self) -> frozenset[str]:
         """The effect of the library that makes the noise of pixels at rest, where that is certain."""
         entries = (entry for entry in self.entries if entry.name == NOISE_AT_REST)
+        return frozenset(name for entry in entries for name in self.identified_by(entry))
+
+    @property
+    def _doubtful(self) -> frozenset[str]:
+        """Effects of the library of which something is seen that speaks against each of them."""
+        entries = (entry for entry in self.entries if entry.details.get("doubtful", False))
         return frozenset(name for entry in entries for name in self.identified_by(entry))
 
     @property

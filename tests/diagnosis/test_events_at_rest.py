@@ -145,7 +145,7 @@ def at_random(count: int, on: float, seed: int = 0, together: int = 1) -> tuple[
     t = np.sort(np.repeat(rng.uniform(0, 1, count // together), together))
     pixels = rng.integers(0, 1000, len(t))
     events = Events(t, pixels % 50, pixels // 50, rng.random(len(t)) < on, 50, 20)
-    return events, Rests(np.arange(1000, dtype=np.int32), np.zeros(1000), np.ones(1000))
+    return events, Rests(np.arange(1000, dtype=np.int32), np.zeros(1000), np.ones(1000), np.zeros(1000))
 
 
 def test_events_of_all_pixels_at_once_are_a_lamp_and_no_noise():
@@ -161,7 +161,7 @@ def test_what_a_slow_pixel_sends_late_in_short_rests_is_no_leak(goes_on):
     rng = np.random.default_rng(5)
     pixels = np.arange(1000, dtype=np.int32)
     begin = rng.uniform(0.1, 0.4, 1000)
-    rests = Rests(pixels, begin, np.where(pixels < 700, begin + 0.15, 1.0))
+    rests = Rests(pixels, begin, np.where(pixels < 700, begin + 0.15, 1.0), np.zeros(1000))
     at = rng.integers(0, 1000, 3000)
     since = rng.uniform(0, 1 if goes_on else 0.15, 3000)
     inside = since < (rests.end - rests.begin)[at]
@@ -180,7 +180,7 @@ def test_what_pixels_beside_moving_ones_send_is_no_leak(everywhere):
     rng = np.random.default_rng(6)
     pixels = np.arange(2000, dtype=np.int32)
     still = pixels[(pixels % 50) % 25 > 4]  # strips of five columns move
-    rests = Rests(still, np.zeros(len(still)), np.ones(len(still)))
+    rests = Rests(still, np.zeros(len(still)), np.ones(len(still)), np.zeros(len(still)))
     beside = np.isin((still % 50) % 25, (5, 6, 23, 24))
     senders = still if everywhere else still[beside]
     at = rng.choice(senders, 3000)
@@ -222,6 +222,26 @@ def test_bursts_of_frames_of_both_polarities_are_no_noise():
     assert judge_events_at_rest(rests, events, 0, frame_gap=1e-4) is None
 
 
+@pytest.mark.parametrize("bright", [0.5, 0.7, 0.9])
+def test_noise_that_grows_with_light_is_in_doubt(bright):
+    """Of shot noise a camera sends less in bright light; nothing that dase knows sends more there."""
+    rng = np.random.default_rng(7)
+    events, rests = at_random(2000, 0.5)
+    rests = replace(rests, level=np.arange(1000) / 1000)
+    pixels = np.where(rng.random(2000) < bright, 500, 0) + rng.integers(0, 500, 2000)
+    events = Events(events.t, pixels % 50, pixels // 50, events.p, 50, 20)
+    entry = judge_events_at_rest(rests, events, 0, settings=replace(AT_REST, pairs=10))
+    assert entry.details.get("doubtful", False) is (bright == 0.9)
+    assert ("bright pixels send" in entry.sentence) is (bright == 0.9)
+    told = replace(entry, details={**entry.details, "independent": 0.5})
+    (said,) = SeenEffects((told,)).findings([Finding("shot", Grade.SUPPORTED)], ())
+    sure = bright != 0.9
+    assert (said.grade, said.unknown) == (Grade.CERTAIN if sure else Grade.EITHER, not sure)
+    dimmer = replace(rests, level=-rests.level)  # which shot noise does
+    assert "doubtful" not in judge_events_at_rest(dimmer, events, 0).details
+    assert "doubtful" not in judge_events_at_rest(replace(rests, level=np.zeros(1000)), events, 0).details
+
+
 def test_polarities_that_are_neither_both_nor_one_tell_nothing():
     events, rests = at_random(2000, 0.9)
     assert judge_events_at_rest(rests, events, 0) is None
@@ -235,7 +255,7 @@ def test_noise_of_either_polarity_may_be_a_pattern_of_its_own(own):
     on, off = rng.poisson(5 * rates[0]), rng.poisson(4 * rates[int(own)])
     at = np.repeat(np.tile(np.arange(1000), 2), np.concatenate([on, off]))
     p = np.repeat([True, False], [on.sum(), off.sum()])
-    rests = Rests(np.arange(1000, dtype=np.int32), np.zeros(1000), np.ones(1000))
+    rests = Rests(np.arange(1000, dtype=np.int32), np.zeros(1000), np.ones(1000), np.zeros(1000))
     assert differ_by_polarity(p, at, rests) is own
 
 
@@ -290,7 +310,7 @@ def test_what_a_slow_clock_stamps_early_is_no_leak(scene):
     """The tick before an event may be before its light began to move."""
     ticks = seen_by(scene, timestamp=dict(step=5e-3))
     rests = find_rests(Measurement(ticks, scene), still=0.02, log_eps=1e-3, seed=0)
-    late = Rests(rests.pixels, rests.begin, rests.end + AT_REST.lead)
+    late = Rests(rests.pixels, rests.begin, rests.end + AT_REST.lead, rests.level)
     assert len(late.events_in(ticks)[0]) > len(rests.events_in(ticks)[0]) + AT_REST.events
     assert found(scene, ticks) is None
 

@@ -10,6 +10,7 @@ from helpers.frame_simulator import bright_texture, counted_between_frames, shak
 from helpers.sensors import sensor_with
 
 import dase
+from dase.diagnosis.diagnose import diagnose
 from dase.diagnosis.kinked_response import KINK, find_kinked_response
 from dase.diagnosis.light_between_events import LightBetweenEvents
 from dase.effects import EFFECTS
@@ -17,6 +18,7 @@ from dase.effects.made_signatures import told_by
 from dase.effects.vignetting import Vignetting
 from dase.errors import InputError
 from dase.fitting.measurement import Measurement
+from dase.results import Grade
 from dase.scenes.video import VideoScene
 from dase.signatures.kinds import KINK_AT_CORNERS, KINKED_RESPONSE
 from dase.simulation.sensor import Sensor
@@ -52,6 +54,25 @@ def test_the_line_of_v2e_is_told_whatever_thresholds_do(scene, spread, more):
     assert entry.name == KINKED_RESPONSE
     assert told_by(entry, EFFECTS) == ("linlog",)
     assert entry.size == entry.details["knee"] == 20 / 255
+
+
+@pytest.mark.slow
+def test_a_diagnosis_says_what_makes_it_and_how_far_errors_fall(scene):
+    events = counted_between_frames(with_dark_corners(scene, 0.5), 0.0, leak=3.0)
+    library = {name: EFFECTS[name] for name in ("linlog", "vignetting", "leak", "shot")}
+    said = diagnose(events, scene=scene, effects=library, pixels=200)
+    assert said.selected[:2] == ("linlog", "vignetting")
+    assert len(said.errors) == len(said.selected) + 1
+    assert said.errors[0] > said.errors[1] > said.errors[2]
+    told = {one.effect: one for one in said.findings}
+    for n, name in enumerate(("linlog", "vignetting")):
+        assert told[name].grade is Grade.CERTAIN
+        assert (told[name].error_without, told[name].error_with) == said.errors[n : n + 2]
+    assert said.sensor["linlog"].knee == said.parameters["linlog.knee"].value == 20 / 255
+    assert said.sensor["linlog"].slope == said.parameters["linlog.slope"].value == pytest.approx(np.log(20))
+    assert said.parameters["vignetting.loss"].value == pytest.approx(0.5, abs=0.06)
+    bare = diagnose(events, scene=scene, effects={"leak": EFFECTS["leak"]}, pixels=200, most=1)
+    assert "linlog" not in bare.sensor  # a library without it
 
 
 @pytest.mark.parametrize("loss", [0.4, 0.7])
