@@ -129,8 +129,8 @@ class HeldClipSettings:
     """Of a frame before its end: rounded stamps of the next frame's time."""
 
     exact: float = 0.98
-    """Share of the events that have the time of a frame to the microsecond, from which on that is a clock
-    whose ticks are frames: it shows the tick before an event. IEBCS has 0.94 at most."""
+    """Share of the events that have the time of a frame to the microsecond, or one of such parts, from which
+    on that is a clock whose ticks are frames: it shows the tick before an event. IEBCS has 0.94 at most."""
 
     late: tuple[float, float] = (0.1, 0.9)
     """Times after a frame at which events that tell of it have waited: from frame to frame."""
@@ -168,7 +168,7 @@ def holds_frames(events: Events, scene: Scene, settings: HeldClipSettings = HELD
     parts, exact = even_parts(late, gap)
     even = exact & (parts <= settings.shares)
     at_frame = late < 0.6e-6
-    if at_frame.mean() >= settings.exact or even.mean() >= settings.spread_out:
+    if (at_frame | even).mean() >= settings.exact or even.mean() >= settings.spread_out:
         return False
     if come_at_even_parts(frame, late, gap, settings):
         return False
