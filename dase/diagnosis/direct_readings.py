@@ -210,18 +210,18 @@ def _effects_of(
         return out  # by what groups of pixels differ is not known
     lines = np.array([one.line() for one in groups])
     errors = NINETY * lines.std(axis=0, ddof=1) / math.sqrt(len(groups))
-    early = _early_half(delays)
+    apart = _half_apart(delays)
     near = settings.middle * delays.gap
-    in_the_middle = abs(late - 0.5 * delays.gap) <= near and early[0] <= near
+    in_the_middle = abs(late - 0.5 * delays.gap) <= near and apart[0] <= near
     if late >= settings.latency and not in_the_middle:
         half = math.hypot(float(errors[0]), settings.known * late)
         sentence = f"events come {format_seconds(late)} after the frame that makes them, in bright light, too"
         mine = {"latency.delay": Estimate(late, late - half, late + half)}
         out.append((Latency(delay=late, light=0.0), sentence, mine))
-    if early[0] >= settings.jitter and early.max() <= settings.even * early.min():
-        jitter = float(early.mean())
-        apart = np.array([_early_half(one).mean() for one in groups])
-        half = math.hypot(NINETY * float(apart.std(ddof=1)) / math.sqrt(len(groups)), settings.known * jitter)
+    if apart[0] >= settings.jitter and apart.max() <= settings.even * apart.min():
+        jitter = float(apart.mean())
+        each = np.array([_half_apart(one).mean() for one in groups])
+        half = math.hypot(NINETY * float(each.std(ddof=1)) / math.sqrt(len(groups)), settings.known * jitter)
         sentence = f"events of the same frame and the same way to go come {format_seconds(jitter)} apart"
         mine = {"timestamp.jitter": Estimate(jitter, jitter - half, jitter + half)}
         out.append((Timestamp(jitter=jitter, step=0.0), sentence, mine))
@@ -267,10 +267,14 @@ def _vignetting_of(
     return Vignetting(loss=loss), sentence, {"vignetting.loss": Estimate(loss, low, high)}
 
 
-def _early_half(delays: DelaysAfterFrames, bins: int = 4) -> np.ndarray:
-    """Return how far the early events of a bin of short ways lie before its median [s], shape (B,)."""
-    _, late = delays.quantiles((0.16, 0.5))
-    half: np.ndarray = late[:bins, 1] - late[:bins, 0]
+def _half_apart(delays: DelaysAfterFrames, bins: int = 4) -> np.ndarray:
+    """Return how far the early events of a bin of short ways lie before its median [s], shape (B,).
+
+    Of latencies that are drawn about 0 half are 0, and the late ones tell how far apart they are.
+    """
+    _, late = delays.quantiles((0.16, 0.5, 0.84))
+    early, later = np.diff(late[:bins]).T
+    half: np.ndarray = later if early.max() < 0.1 * later.min() else early
     return half
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from helpers.frame_simulator import HEIGHT, WIDTH, counted_between_frames, shaken_texture
@@ -10,7 +12,7 @@ import dase
 from dase.effects import EFFECTS
 from dase.effects.threshold import Threshold
 from dase.events import Events
-from dase.fitting.held_clips import come_at_even_parts, holds_frames
+from dase.fitting.held_clips import HELD_CLIPS, come_at_even_parts, holds_frames
 from dase.fitting.measurement import as_measurement
 from dase.scenes.video import VideoScene
 from dase.simulation.sensor import Sensor
@@ -130,12 +132,43 @@ def test_events_at_frames_and_at_parts_of_them_are_not_early(scene, halves):
     """Of a clip of v2e with steps of its light most frames had one event a pixel, and those of a step two. It
     was taken as held, and had a *jitter*, certain and wrong."""
     gap = float(np.diff(scene.sample_times())[0])
-    events = held_frames(scene, early=True, late=0.0)
+    events = counted_between_frames(scene, 0.0)
     rng = np.random.default_rng(4)
-    t = np.round(events.t / gap) * gap + 0.5 * gap * (rng.random(len(events)) < halves)
+    t = np.ceil(events.t / gap) * gap - 0.5 * gap * (rng.random(len(events)) < halves)
     order = np.argsort(t, kind="stable")
     stamped = Events(t[order], events.x[order], events.y[order], events.p[order], WIDTH, HEIGHT)
-    assert not holds_frames(stamped, scene)
+    # however far light goes after a frame
+    assert not holds_frames(stamped, scene, replace(HELD_CLIPS, sooner=0.0))
+
+
+def test_held_frames_without_any_latency_are_told_by_the_memory_of_pixels(scene):
+    """All events have the time of the frame before theirs, as ticks of a clock do that rounds down."""
+    gap = float(np.diff(scene.sample_times())[0])
+    events = held_frames(scene, early=True)
+    t = np.round(events.t / gap) * gap
+    assert holds_frames(Events(t, events.x, events.y, events.p, WIDTH, HEIGHT), scene)
+    counted = counted_between_frames(scene, 0.0)
+    t = np.floor(counted.t / gap) * gap
+    assert not holds_frames(Events(t, counted.x, counted.y, counted.p, WIDTH, HEIGHT), scene)
+
+
+@pytest.mark.parametrize("early", [True, False])
+@pytest.mark.parametrize("noise", [0.0, 0.1])
+def test_latencies_that_are_drawn_about_nothing_tell_of_held_frames_as_well(scene, early, noise, rng):
+    """Half of them are none at all, and the others thin out; some noise comes at any time."""
+    gap = float(np.diff(scene.sample_times())[0])
+    events = held_frames(scene, early=early)
+    late = np.maximum(rng.normal(0.0, 0.25 * gap, len(events)), 0.0)
+    late = np.where(rng.random(len(events)) < noise, rng.uniform(0.0, gap, len(events)), late)
+    t = np.round(events.t / gap) * gap + late
+    order = np.argsort(t, kind="stable")
+    spread = Events(t[order], events.x[order], events.y[order], events.p[order], WIDTH, HEIGHT)
+    assert holds_frames(spread, scene) is early
+    # at frames, and at any time between: noise that is drawn at each, and light that goes on
+    t = np.round(events.t / gap) * gap + gap * np.maximum(rng.uniform(-1.0, 1.0, len(events)), 0.0)
+    order = np.argsort(t, kind="stable")
+    even = Events(t[order], events.x[order], events.y[order], events.p[order], WIDTH, HEIGHT)
+    assert not holds_frames(even, scene)
 
 
 def test_few_events_tell_nothing(scene):
