@@ -167,7 +167,10 @@ def diagnose(
     seen = without_the_scene(compared.seen, part, start.sensor, seed, in_step=in_step)
     doubles = seen.entry_of(DOUBLE_EVENTS)
     if doubles is not None:
-        state.try_doubles(doubles.details["gap"], doubles.details.get("opposite", False))
+        known = doubles.details
+        state.try_doubles(
+            known["gap"], spread=known.get("spread", 0.0), opposite=known.get("opposite", False)
+        )
     if compared.guessed is not None:
         tell("how well the scene is known", 0.0, before)
         state.doubt_scene(with_scene_doubt(state.task.evidence, compared.guessed, start, seed=seed))

@@ -3,7 +3,8 @@
 Where light moves fast, two events of a pixel are as close together. Where it hardly changes from two frames
 before the first to two frames behind the second, nothing is due after an event, and what comes all the same
 is noise or a double. Noise comes as often at all times, a double some time after its event: pairs of nearly
-one interval stand out between two octaves of shorter and of longer ones. Whole frames are asked, not light
+one interval stand out between two octaves of shorter and of longer ones; or all that come up to some time
+after their event, as a simulator may draw them, with hardly any later. Whole frames are asked, not light
 between them: a simulator may hold a frame, or send all events of a change at its end.
 """
 
@@ -85,6 +86,14 @@ class LateDoubleSettings:
     width: float = 0.9
     """Logarithm of the ninth over the first tenth of the intervals, at most: that of noise is 1 and more."""
 
+    none_later: float = 0.03
+    """Pairs in the two octaves after the last double per pair, at most, where doubles come at any time up to
+    then: 0.001 and none in three clips."""
+
+    evenly: float = 0.1
+    """How far the shares of the pairs up to a time may be off from those of times that are drawn evenly, at
+    most, beside chance: 0.05 and less there."""
+
     chained: float = 0.125
     """Share of the pairs with another event as soon before or after, at most."""
 
@@ -126,6 +135,7 @@ class _Window:
         interval: Of each [s].
         beside: Pairs of the two octaves below and above.
         end: Of the window [s].
+        evenly: Whether it is of all intervals up to the end, as if drawn evenly; none are below it then.
     """
 
     opposite: bool
@@ -133,6 +143,7 @@ class _Window:
     interval: NDArray[np.float64]
     beside: tuple[int, int]
     end: float
+    evenly: bool = False
 
 
 def find_late_doubles(
@@ -224,7 +235,10 @@ def _light_around(
 
 
 def _likely_windows(found: _InSlowLight, s: LateDoubleSettings) -> Iterator[_Window]:
-    """Yield the window of two octaves that stands out most, of pairs of one polarity and of opposite ones."""
+    """Yield what stands out most, of pairs of one polarity and of opposite ones.
+
+    The window of two octaves, and the longest interval up to which pairs come, with hardly any later.
+    """
     octave = 4  # windows begin a quarter of one apart
     count = octave * math.ceil(math.log2(4 * s.longest / s.shortest)) + 1
     edges = s.shortest * 2.0 ** (np.arange(count) / octave)
@@ -248,6 +262,11 @@ def _likely_windows(found: _InSlowLight, s: LateDoubleSettings) -> Iterator[_Win
         yield _Window(
             opposite, first[kept], interval[kept], (int(sooner[best]), int(later[best])), edges[best + two]
         )
+        end = edges[begins + two]
+        before = sums[begins + two]
+        best = int(np.where(before >= s.fewest, before / (later + 3), 0.0).argmax())
+        kept = (interval >= edges[0]) & (interval < end[best])
+        yield _Window(opposite, first[kept], interval[kept], (0, int(later[best])), end[best], evenly=True)
 
 
 def _judge_window(
@@ -271,14 +290,14 @@ def _judge_window(
     doubt = s.alike + 1.5 * width / 2.56 * math.sqrt(float((1 / np.maximum(seconds, 1)).sum()))
     light = found.level[window.first]
     near = np.sort(window.interval)
+    if not _keeps_its_time(window, near, width, s):
+        return None
     one_interval = (np.searchsorted(near, 1.01 * near + 5e-7, side="right") - np.arange(pairs)).max() / pairs
     if (
-        sum(window.beside) > s.beside * pairs
-        or (shares if both else shares.max()).min() < least
+        (shares if both else shares.max()).min() < least
         or (both and shares.max() > s.balance * (1 + 2 / math.sqrt(few)) * shares.min())
         or (both and _differ(logs, on) > doubt)
         or _differ(logs, light > np.median(light)) > doubt
-        or width > s.width
         or max(_chained(found, window)) > s.chained
         or ((shared > s.shared or _is_of_frames(delay, step)) and one_interval > s.same)
     ):
@@ -288,17 +307,44 @@ def _judge_window(
     # every quarter of an octave has been looked at, of both kinds
     chance = 70 * float(stats.binom.sf(pairs - 1, pairs + max(window.beside), 0.5))
     kind = "of the other polarity" if window.opposite else "of the same polarity"
+    at = f"up to {format_seconds(_longest(near))}" if window.evenly else f"about {format_seconds(delay)}"
     entry = Signature(
         name=DOUBLE_EVENTS, answer=Answer.NOT_SEEN, p=min(chance, 1.0), size=pairs / (events - pairs),
         low=low, high=high, unit="share of the events", least=s.least,
         sentence=f"{format_percent(pairs / (events - pairs))} of the events where light does not change have "
-        f"another {kind} about {format_seconds(delay)} later, {format_count(sum(window.beside))} pairs "
+        f"another {kind} {at} later, {format_count(sum(window.beside))} pairs "
         f"sooner or later beside {format_count(pairs)}",
         details={
-            "near": pairs, "later": window.beside[1], "at_once": 0, "gap": delay, "opposite": window.opposite
+            "near": pairs, "later": window.beside[1], "at_once": 0, "opposite": window.opposite,
+            "gap": 0.5 * _longest(near) if window.evenly else delay,
+            "spread": _longest(near) if window.evenly else 0.0,
         },
     )  # fmt: skip
     return judge_signature(entry, level, "")
+
+
+def _keeps_its_time(
+    window: _Window, interval: NDArray[np.float64], width: float, s: LateDoubleSettings
+) -> bool:
+    """Whether pairs of a window come about one time after their event, or evenly up to one, and few others.
+
+    Args:
+        window: The pairs.
+        interval: From event to event, ascending [s].
+        width: Logarithm of the ninth over the first tenth of these.
+        s: Which pairs are doubles.
+    """
+    pairs = len(interval)
+    if not window.evenly:
+        return sum(window.beside) <= s.beside * pairs and width <= s.width
+    last = _longest(interval)
+    off = np.abs((np.arange(pairs) + 0.5) / pairs - np.minimum(interval / last, 1.0)).max()
+    return window.beside[1] <= s.none_later * pairs and off <= s.evenly + 1.2 / math.sqrt(pairs)
+
+
+def _longest(interval: NDArray[np.float64]) -> float:
+    """Return the longest of some intervals, ascending, but for one in two hundred [s]."""
+    return float(interval[max(0, math.ceil(0.995 * len(interval)) - 1)])
 
 
 def _differ(logs: NDArray[np.float64], some: NDArray[np.bool_]) -> float:

@@ -135,6 +135,7 @@ class DiagnosisState:
         evaluations_before: Simulations that were run before the measurement was split anew.
         samples_before: Pixels times samples of those.
         double_gap: Mean time from an event to its double [s], which are tried where it is not 0.
+        double_spread: How far these times are apart, evenly [s]; 0 where they hardly differ.
         double_opposite: Whether the double has the other polarity.
         unlike_poles: Two that events are seen to be behind, see `Observations`; empty where they are not.
     """
@@ -149,6 +150,7 @@ class DiagnosisState:
     evaluations_before: int = 0
     samples_before: int = 0
     double_gap: float = 0.0
+    double_spread: float = 0.0
     double_opposite: bool = False
     unlike_poles: tuple[float, ...] = ()
 
@@ -166,15 +168,16 @@ class DiagnosisState:
         """Go on with the same parts of the measurement, with what their scene is not known to."""
         self.task = replace(self.task, evidence=evidence)
 
-    def try_doubles(self, gap: float, opposite: bool) -> None:
+    def try_doubles(self, gap: float, *, spread: float = 0.0, opposite: bool = False) -> None:
         """Let double events be tried, that are so much later [s]: they are seen, and not of the scene.
 
         Args:
-            gap: From an event to its double [s].
+            gap: From an event to its double, in the mean [s].
+            spread: How far these times are apart, evenly [s].
             opposite: Whether the double has the other polarity.
         """
-        self.double_gap, self.double_opposite = gap, opposite
-        evidence = replace(self.task.evidence, double_gap=gap, double_opposite=opposite)
+        self.double_gap, self.double_spread, self.double_opposite = gap, spread, opposite
+        evidence = replace(self.task.evidence, double_gap=gap, double_spread=spread, double_opposite=opposite)
         self.task = replace(self.task, evidence=evidence)
 
     def try_unlike_poles(self, poles: tuple[float, ...]) -> None:
@@ -187,7 +190,7 @@ class DiagnosisState:
         self.evaluations_before, self.samples_before = self.evaluations, self.samples
         self.task = replace(self.task, evidence=evidence, all_time=True)
         if self.double_gap:
-            self.try_doubles(self.double_gap, self.double_opposite)
+            self.try_doubles(self.double_gap, spread=self.double_spread, opposite=self.double_opposite)
         if self.unlike_poles:
             self.try_unlike_poles(self.unlike_poles)
 

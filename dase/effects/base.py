@@ -161,6 +161,7 @@ class Observations:
         column_load: The same of one that takes columns.
         stamped_again: Share of the events that a scan has stamped like the one before of their pixel.
         double_gap: Mean time from an event to its double [s] where pixels are seen to send twice, else 0.
+        double_spread: How far these times are apart, evenly [s]; 0 where they hardly differ.
         double_opposite: Whether the double has the other polarity.
         unlike_poles: Of light that events are seen to be behind: cutoff of a pole that goes with the light,
             at intensity 1 [Hz], its photocurrent at intensity 0 relative to that, and the cutoff of one that
@@ -186,6 +187,7 @@ class Observations:
     column_load: float = math.inf
     stamped_again: float = 0.0
     double_gap: float = 0.0
+    double_spread: float = 0.0
     double_opposite: bool = False
     unlike_poles: tuple[float, ...] = ()
 

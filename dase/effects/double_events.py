@@ -31,6 +31,7 @@ class Doubler(Reader):
         shares: Of OFF and of ON events.
         delay: From an event to its double [ns].
         tail: Mean of what may be added to it [ns].
+        spread: What may be added to it evenly, at most [ns].
         opposite: Whether a double has the other polarity.
         random: Random numbers, in the order of the events.
         empty: A stream without events.
@@ -44,12 +45,13 @@ class Doubler(Reader):
         shares: tuple[float, float],
         delay: float,
         tail: float,
+        spread: float,
         opposite: bool,
         random: np.random.Generator,
         empty: Events,
     ):
-        self._shares, self._delay, self._tail, self._random = np.array(shares), delay, tail, random
-        self._opposite = opposite
+        self._shares, self._delay, self._random = np.array(shares), delay, random
+        self._tail, self._spread, self._opposite = tail, spread, opposite
         self._waiting, self._at, self._second = empty, np.empty(0, np.int64), np.empty(0, np.int64)
 
     def push(self, events: Events, until: float) -> tuple[Events, float]:
@@ -57,6 +59,7 @@ class Doubler(Reader):
         chance, more = self._random.random((len(events), 2)).T
         again = np.flatnonzero(chance < self._shares[events.p.astype(np.int64)])
         late = np.minimum(-np.log1p(-more[again]), self.longest) * self._tail + self._delay
+        late += more[again] * self._spread
         own = to_nanoseconds(events.t)
         doubles = own[again] + np.maximum(np.rint(late), 1).astype(np.int64)
         second_time = events.select(again)
@@ -86,8 +89,9 @@ class DoubleEvents(StreamEffect):
     DAVIS240B 0.4 %, after 1 to 5 us. They tell nothing of the light, and count in all rates.
 
     An OFF event has a double with the probability `share`, an ON event with `share` · `on`. It comes `delay`
-    later, and an exponentially distributed time of mean `tail` beyond, cut at 20 `tail`. So the rate grows by
-    the factor 1 + `share` (of OFF events), and in the histogram of intervals `share` is at `delay`.
+    later, and an exponentially distributed time of mean `tail` beyond, cut at 20 `tail`, or one that is drawn
+    evenly up to `spread`, as simulators do (of both, the longer one beside the longer one). So the rate grows
+    by the factor 1 + `share` (of OFF events), and in the histogram of intervals `share` is at `delay`.
     """
 
     name: ClassVar[str] = "double_events"
@@ -128,6 +132,14 @@ class DoubleEvents(StreamEffect):
         about="mean of what is added to it",
         fitted=False,
     )
+    spread: float = parameter(
+        0.0,
+        unit="s",
+        bounds=(0.0, 1e-2),
+        plausible=(0.0, 2e-5),
+        about="what is added to it evenly, at most",
+        fitted=False,
+    )
     polarity: str = choice(
         "same", among=("same", "opposite"), about="of the double, relative to that of its event"
     )
@@ -136,7 +148,10 @@ class DoubleEvents(StreamEffect):
     def candidates(cls, observed: Observations) -> list[Self]:
         """Return them where they are seen in the events themselves, see the signature of double events."""
         polarity = "opposite" if observed.double_opposite else "same"
-        return [cls(delay=observed.double_gap, polarity=polarity)] if observed.double_gap else []
+        if not observed.double_gap:
+            return []
+        spread = observed.double_spread
+        return [cls(delay=observed.double_gap - 0.5 * spread, spread=spread, polarity=polarity)]
 
     def longest_delay(self, lines: int) -> float:
         """Return infinity where there are doubles: they are more events, however soon they come."""
@@ -145,6 +160,6 @@ class DoubleEvents(StreamEffect):
     def reader(self, width: int, height: int, seed: int) -> Doubler:
         """Return what doubles the events of one sensor."""
         return Doubler(
-            (self.share, self.share * self.on), 1e9 * self.delay, 1e9 * self.tail,
+            (self.share, self.share * self.on), 1e9 * self.delay, 1e9 * self.tail, 1e9 * self.spread,
             self.polarity == "opposite", random_numbers(seed, self.name), Events.empty(width, height),
         )  # fmt: skip

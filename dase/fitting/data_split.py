@@ -107,6 +107,7 @@ class SplitMeasurement:
             not, see `frame_step_of`.
         clip_frames: Time from frame to frame of a clip [s], 0 of another scene.
         double_gap: Mean time from an event to its double [s] where pixels are seen to send twice, else 0.
+        double_spread: How far these times are apart, evenly [s]; 0 where they hardly differ.
         double_opposite: Whether the double has the other polarity.
         unlike_poles: Two that events are seen to be behind, see `Observations`; empty where they are not.
     """
@@ -127,6 +128,7 @@ class SplitMeasurement:
     frame_step: float = 0.0
     clip_frames: float = 0.0
     double_gap: float = 0.0
+    double_spread: float = 0.0
     double_opposite: bool = False
     unlike_poles: tuple[float, ...] = ()
 
@@ -153,6 +155,7 @@ class SplitMeasurement:
             clip_step=self.frame_step,
             clip_frames=self.clip_frames,
             double_gap=self.double_gap,
+            double_spread=self.double_spread,
             double_opposite=self.double_opposite,
             unlike_poles=self.unlike_poles,
         )

@@ -50,6 +50,21 @@ def test_doubles_are_told_with_their_delay_share_and_polarity(clip, delay, polar
     assert found.details["opposite"] == (polarity == "opposite")
 
 
+@pytest.mark.parametrize(("longest", "polarity"), [(3e-4, "same"), (9e-4, "opposite"), (2e-3, "same")])
+def test_doubles_that_come_at_any_time_up_to_one_are_told(clip, longest, polarity):
+    doubles = DoubleEvents(share=0.06, delay=0.0, spread=longest, polarity=polarity)
+    found = find_late_doubles(events_of(clip, doubles), clip)
+    assert found.found
+    assert "up to" in found.sentence
+    assert found.size == pytest.approx(0.06, rel=0.35)
+    assert found.details["spread"] == pytest.approx(longest, rel=0.05)
+    assert found.details["gap"] == pytest.approx(0.5 * longest, rel=0.05)
+    assert found.details["opposite"] == (polarity == "opposite")
+    # long tails come at any time as well, and later
+    tail = DoubleEvents(share=0.06, delay=0.0, tail=longest / 2, polarity=polarity)
+    assert not find_late_doubles(events_of(clip, tail), clip).found
+
+
 @pytest.mark.parametrize(
     "effects",
     [

@@ -103,6 +103,7 @@ DOUBLES = [
     DoubleEvents(share=0.9, delay=0.0, tail=4e-6),
     DoubleEvents(share=0.05, on=0.0, delay=6e-7, tail=1e-6),
     DoubleEvents(share=0.2, on=0.5, delay=2.3e-3, polarity="opposite"),
+    DoubleEvents(share=0.3, delay=0.0, spread=3e-4),
 ]
 
 
@@ -117,8 +118,9 @@ def test_doubles_are_their_twin_however_the_stream_is_cut(rng, effect, tick):
     )
     shares = effect.share, effect.share * effect.on
     want = twin.doubled(
-        rows, shares, 1e9 * effect.delay, 1e9 * effect.tail, draws, effect.polarity == "opposite"
-    )
+        rows, shares, 1e9 * effect.delay, 1e9 * effect.tail, draws, effect.polarity == "opposite",
+        1e9 * effect.spread,
+    )  # fmt: skip
     assert len(want) > len(events)
     got = zip(ns(whole), whole.x.tolist(), whole.y.tolist(), whole.p.astype(int).tolist(), strict=True)
     assert list(got) == want

@@ -208,6 +208,7 @@ def doubled(
     tail: float,
     draws: np.ndarray,
     opposite: bool = False,
+    spread: float = 0.0,
 ) -> list[Event]:
     """Return events and the doubles of some.
 
@@ -218,11 +219,13 @@ def doubled(
         tail: Mean of what is added to it [ns].
         draws: Two random numbers for each event, shape (N, 2).
         opposite: Whether doubles have the other polarity.
+        spread: What is added evenly, at most [ns].
     """
     out = [(event[0], 0, n, event) for n, event in enumerate(events)]
     for n, (event, (chance, more)) in enumerate(zip(events, draws, strict=True)):
         if chance < shares[event[3]]:
-            later = event[0] + max(round(delay + min(-math.log(1 - more), 20.0) * tail), 1)
+            late = delay + min(-math.log(1 - more), 20.0) * tail + more * spread
+            later = event[0] + max(round(late), 1)
             polarity = 1 - event[3] if opposite else event[3]
             out.append((later, 1, n, (later, *event[1:3], polarity)))
     return [event for *_, event in sorted(out)]
