@@ -94,6 +94,11 @@ class LampSettings:
     """Swing of the clip's own light in the place, relative to that of the events, from which on the tone is
     the scene's: 0.09 at most under lamps, 0.58 and more of what moves."""
 
+    of_turns: float = 0.8
+    """Share of the power of the light's change in the place that is of one slower tone and its multiples,
+    from which on each of these is the scene's: pixels that see the same send together, at multiples of its
+    rate. 0.99 in a clip whose light goes to and fro at 10 Hz."""
+
     most_of_all: float = 0.6
     """Share of the array from which on a lamp lights all of it."""
 
@@ -163,7 +168,8 @@ def find_lamp_in_part(
     # of a lamp and its overtones the strongest; if that is the scene's, pixels make the others of it
     lamp = max(lamps, key=lambda one: one.swing)
     place = lamp.place[counts.tile_of_pixel]
-    if _swing_in_light(measurement, place, lamp.frequency, log_eps=log_eps) >= s.of_scene * lamp.swing:
+    light = _LightChange.of(measurement, place, log_eps=log_eps)
+    if light.swing(lamp.frequency) >= s.of_scene * lamp.swing or light.has_multiple(lamp.frequency, s):
         return None
     return LampInPart(_signature_of(lamp, place, counts.duration, s), place)
 
@@ -416,25 +422,69 @@ def _part_of_frames(frequency: float, step: float, duration: float) -> int:
     return 0
 
 
-def _swing_in_light(
-    measurement: Measurement, place: NDArray[np.bool_], frequency: float, *, log_eps: float
-) -> float:
-    """Return by how much a tone moves the light's change in a place, or its rises or falls, relative to all.
+@dataclass(frozen=True)
+class _LightChange:
+    """By how much the light of a clip goes in a place from instant to instant, all pixels together.
 
-    Above half of the rate of frames a tone looks like a slower one, in the light as in the events.
+    Args:
+        middle: Between two instants [s], shape (K,).
+        rises: Of log intensity, shape (K,).
+        falls: The same.
     """
-    times = times_that_are_compared(measurement)
-    pixels = np.flatnonzero(place.ravel()).astype(np.int32)
-    pixels = pixels[:: max(1, len(pixels) // 4000)]
-    if len(times) < 3 or not len(pixels):
-        return 0.0
-    change = np.diff(log_light_of(measurement.scene, times, pixels, log_eps=log_eps), axis=0)
-    rises, falls = np.maximum(change, 0).sum(1, dtype=float), np.maximum(-change, 0).sum(1, dtype=float)
-    middle = 0.5 * (times[1:] + times[:-1])
-    tried = frequency + 0.7 * np.linspace(-1, 1, 9) / max(float(times[-1] - times[0]), 1e-3)
-    waves = np.exp(-2j * np.pi * tried[:, None] * middle)
-    tones = (float(np.abs(waves @ (one - one.mean())).max()) for one in (rises - falls, rises, falls))
-    return max(tones) / max(float((rises + falls).sum()), 1e-9)
+
+    middle: NDArray[np.float64]
+    rises: NDArray[np.float64]
+    falls: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, measurement: Measurement, place: NDArray[np.bool_], *, log_eps: float) -> _LightChange:
+        """Return that of some pixels of a place, shape (H, W)."""
+        times = times_that_are_compared(measurement)
+        pixels = np.flatnonzero(place.ravel()).astype(np.int32)
+        pixels = pixels[:: max(1, len(pixels) // 4000)]
+        if len(times) < 3 or not len(pixels):
+            return cls(*np.empty((3, 0)))
+        change = np.diff(log_light_of(measurement.scene, times, pixels, log_eps=log_eps), axis=0)
+        rises, falls = np.maximum(change, 0).sum(1, dtype=float), np.maximum(-change, 0).sum(1, dtype=float)
+        return cls(0.5 * (times[1:] + times[:-1]), rises, falls)
+
+    @property
+    def duration(self) -> float:
+        """From the first instant to the last, about [s]."""
+        return max(float(self.middle[-1] - self.middle[0]), 1e-3)
+
+    def swing(self, frequency: float) -> float:
+        """Return by how much a tone moves the change, or rises or falls, relative to all.
+
+        Above half of the rate of frames a tone looks like a slower one, in the light as in the events.
+        """
+        if not len(self.middle):
+            return 0.0
+        rises, falls = self.rises, self.falls
+        tried = frequency + 0.7 * np.linspace(-1, 1, 9) / self.duration
+        waves = np.exp(-2j * np.pi * tried[:, None] * self.middle)
+        tones = (float(np.abs(waves @ (one - one.mean())).max()) for one in (rises - falls, rises, falls))
+        return max(tones) / max(float((rises + falls).sum()), 1e-9)
+
+    def has_multiple(self, frequency: float, s: LampSettings) -> bool:
+        """Whether the light goes to and fro at a rate of which a tone is a multiple, and does little else."""
+        if len(self.middle) < 16:
+            return False
+        net = (self.rises - self.falls) * np.hanning(len(self.middle))
+        power = np.abs(np.fft.rfft(net - net.mean())) ** 2
+        tones = np.fft.rfftfreq(len(net), self.duration / (len(net) - 1))
+        slower = tones < 0.5 * frequency
+        strongest = tones[slower][power[slower].argmax()]
+        near = strongest + np.linspace(-1, 1, 41) / self.duration
+        waves = np.exp(-2j * np.pi * near[:, None] * self.middle)
+        rate = float(near[np.abs(waves @ net).argmax()])
+        if rate < 2 / self.duration:
+            return False
+        # a window as this one spreads a tone over two steps on either side
+        off = np.abs(tones - rate * np.rint(tones / rate))
+        of_rate = float(power[(tones > 0.5 * rate) & (off <= 2.5 / self.duration)].sum())
+        multiple = abs(frequency - rate * round(frequency / rate)) <= 1 / self.duration
+        return multiple and of_rate >= s.of_turns * float(power.sum())
 
 
 def _signature_of(tone: _Tone, place: NDArray[np.bool_], duration: float, s: LampSettings) -> Signature:

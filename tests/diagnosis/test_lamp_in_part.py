@@ -97,16 +97,33 @@ def test_where_the_strongest_tone_is_of_the_light_no_other_is_a_lamp(clip, monke
     two = Measurement(dase.simulate(_with_second_tone(), PIXELS, seed=5), clip)
     asked = []
 
-    def swing(measurement, place, frequency, *, log_eps):
+    def swing(self, frequency):
         asked.append(frequency)
         return 1.0 if len(asked) == 1 else 0.0
 
-    monkeypatch.setattr(lamp_in_part, "_swing_in_light", swing)
+    monkeypatch.setattr(lamp_in_part._LightChange, "swing", swing)
     assert find_lamp_in_part(two, log_eps=0.01) is None
     assert len(asked) == 1
     lamp = find_lamp_in_part(two, log_eps=0.01)
     assert lamp is not None
     assert lamp.entry.details["frequency"] == asked[0] == asked[1]
+
+
+@pytest.mark.parametrize(("frequency", "is_so"), [(140.0, True), (139.6, True), (144.0, False), (20.0, True)])
+def test_multiples_of_a_rate_at_which_light_goes_to_and_fro_are_the_scenes(clip, frequency, is_so):
+    """Pixels that see a patch swing at 10 Hz together sent at 140 Hz, too, which had been a lamp, certain."""
+    times = np.arange(0.0, 1.0, 2e-3)
+    light = frames_at(times)
+    patch = np.exp(-1.5 + 1.2 * np.sin(2 * np.pi * 10.0 * times))
+    light[:, PLACE] = patch[:, None]
+    to_and_fro = Measurement(dase.Events.empty(WIDTH, HEIGHT), VideoScene(light, times))
+    change = lamp_in_part._LightChange.of(to_and_fro, PLACE, log_eps=1e-3)
+    assert change.has_multiple(frequency, lamp_in_part.LAMP) is is_so
+    rest = lamp_in_part._LightChange.of(to_and_fro, ~PLACE, log_eps=1e-3)
+    assert not rest.has_multiple(frequency, lamp_in_part.LAMP)
+    few = VideoScene(light[:5], times[:5])
+    short = lamp_in_part._LightChange.of(Measurement(to_and_fro.events, few), PLACE, log_eps=1e-3)
+    assert not short.has_multiple(frequency, lamp_in_part.LAMP)
 
 
 def _with_second_tone():
