@@ -41,8 +41,12 @@ def test_double_events_are_tried_only_where_they_are_seen(scene):
     evidence = split_measurement(measurement, pixels=100)
     state = DiagnosisState(DiagnosisTask(evidence, LIBRARY, 0, lambda *_: None, frozenset()))
     assert DoubleEvents.candidates(state.task.evidence.observe(idle_bus=0.01)) == []
-    for opposite, polarity in ((False, "same"), (True, "opposite")):
-        state.try_doubles(33e-6, opposite)
+    for opposite, polarity, spread in ((False, "same", 0.0), (True, "opposite", 0.0), (False, "same", 40e-6)):
+        state.try_doubles(33e-6, spread=spread, opposite=opposite)
         state.split_anew(replace(evidence))
         tried = DoubleEvents.candidates(state.task.evidence.observe(idle_bus=0.01))
-        assert tried == [DoubleEvents(delay=33e-6, polarity=polarity)]
+        delay = pytest.approx(33e-6 - 0.5 * spread)
+        assert [replace(one, delay=1e-6) for one in tried] == [
+            DoubleEvents(delay=1e-6, spread=spread, polarity=polarity)
+        ]
+        assert [one.delay for one in tried] == [delay]
