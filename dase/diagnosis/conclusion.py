@@ -32,7 +32,7 @@ from dase.fitting.search_ends import parameters_at_bounds
 from dase.fitting.subset import CalibratedSubset
 from dase.probes.distance import Judgement, may_be_announced
 from dase.probes.random_streams import SimulationStream
-from dase.results import DetectionLimit, Diagnosis, Finding, Grade, Step, Unexplained
+from dase.results import DetectionLimit, Diagnosis, Estimate, Finding, Grade, Step, Unexplained
 
 
 def conclude_diagnosis(
@@ -64,9 +64,9 @@ def conclude_diagnosis(
     # what is far too wrong makes no claim about the camera, and steps nearer to it would lead nowhere
     if is_far_off(first.judgement, mine.judgement, task.settings.grades):
         values = values_of(model, [axis.effect.name for axis in model.space.axes])
+        report = model.calibrate(task.evidence.report, repeats=repeats, seed=stream)
     else:
-        model, values = estimate_parameters(task.evidence, model, seed=task.seed)
-    report = model.calibrate(task.evidence.report, repeats=repeats, seed=stream)
+        model, values, report = _with_last_steps(task, model, mine.judgement)
     last = report.judge(stream)
     at_bounds = parameters_at_bounds(model, values)
     judged_effects: dict[str, Finding] = {}
@@ -122,6 +122,32 @@ def conclude_diagnosis(
         level=last.level,
         reach=last.reach,
     )
+
+
+def _with_last_steps(
+    task: DiagnosisTask, model: FittedModel, reached: Judgement
+) -> tuple[FittedModel, dict[str, Estimate], CalibratedSubset]:
+    """Return a model with the last steps of its parameters, their estimates, and the part that reports.
+
+    Steps that lead from the floor to far above it there are not taken: a clip of v2e behind a lens had an
+    error of 0.58, and of 1.4 after them, in one answer.
+
+    Args:
+        task: What the diagnosis is asked.
+        model: The last one of the search.
+        reached: Its error on the part that reports.
+    """
+    stream, repeats = SimulationStream.JUDGE.seed(task.seed), task.settings.repeats
+    improved, values = estimate_parameters(task.evidence, model, seed=task.seed)
+    report = improved.calibrate(task.evidence.report, repeats=repeats, seed=stream)
+    if may_be_announced(report.judge(stream)) or not may_be_announced(reached):
+        return improved, values, report
+    stays = values_of(model, [axis.effect.name for axis in model.space.axes])
+    wide = {
+        name: Estimate(one.value, min(one.value, values[name].low), max(one.value, values[name].high))
+        for name, one in stays.items() if name in values
+    }  # fmt: skip
+    return model, wide, model.calibrate(task.evidence.report, repeats=repeats, seed=stream)
 
 
 def _additions_in_order(task: DiagnosisTask, path: SearchPath, model: FittedModel) -> tuple[str, ...]:
