@@ -130,7 +130,8 @@ def _with_last_steps(
     """Return a model with the last steps of its parameters, their estimates, and the part that reports.
 
     Steps that lead from the floor to far above it there are not taken: a clip of v2e behind a lens had an
-    error of 0.58, and of 1.4 after them, in one answer.
+    error of 0.58, and of 1.4 after them, in one answer. This is chosen by the part that reports, between two
+    models with the same effects, where one of them is at the floor of it already.
 
     Args:
         task: What the diagnosis is asked.

@@ -274,6 +274,7 @@ def _half_apart(delays: DelaysAfterFrames, bins: int = 4) -> np.ndarray:
     """
     _, late = delays.quantiles((0.16, 0.5, 0.84))
     early, later = np.diff(late[:bins]).T
+    # medians of bins with some noise are some microseconds, not 0
     half: np.ndarray = later if early.max() < 0.1 * later.min() else early
     return half
 
