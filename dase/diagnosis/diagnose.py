@@ -30,6 +30,7 @@ from dase.diagnosis.held_frames import (
 from dase.diagnosis.kink_in_model import put_kink_in_model
 from dase.diagnosis.lamp_in_part import LampInPart, find_lamp_in_part
 from dase.diagnosis.mostly_bursts import bursts_of_all_events, with_bursts_of_all_events
+from dase.diagnosis.rate_limited import limit_of_rate, with_limit_of_rate
 from dase.diagnosis.seen_beside_model import (
     look_beside_model,
     settle_dead_time,
@@ -147,6 +148,11 @@ def diagnose(
         lamps = told_by(lamp.entry, effects)
         rest = {name: one for name, one in effects.items() if name not in lamps}
         found = lamp.added_to(again(lamp.rest_of(measurement), sensor=given, effects=rest), effects)
+        found = replace(found, sensor=with_lens(found.sensor, None if measurement.lens else lens))
+        return replace(found, seconds=time.perf_counter() - begin)
+    limit = limit_of_rate(compared, effects) if most > 0 else None
+    if limit is not None:
+        found = with_limit_of_rate(again(measurement, sensor=given.with_effect(limit)), compared, limit)
         found = replace(found, sensor=with_lens(found.sensor, None if measurement.lens else lens))
         return replace(found, seconds=time.perf_counter() - begin)
     bursts = bursts_of_all_events(compared, effects)

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dase.effects.base import Observations, choice, parameter
+from dase.effects.made_signatures import Makes
 from dase.effects.stream import (
     Others,
     SharedReader,
@@ -111,7 +112,8 @@ class RateControl(StreamEffect):
         "programmable event-rate controller and compressive data-formatting pipeline, 2020"
     )
     per_pixel: ClassVar[bool] = False
-    signatures: ClassVar = ()
+    # a share that comes from the period before is no number of events that none exceeds
+    signatures: ClassVar = (Makes("rate limit", tells=True, absence=False),)
 
     rate: float = parameter(
         2e7,
@@ -142,7 +144,7 @@ class RateControl(StreamEffect):
 
     @classmethod
     def candidates(cls, observed: Observations) -> list[Self]:
-        """Return nothing: whoever has switched it on knows it, and a bus explains what it does."""
+        """Return nothing: a limit is seen, and a bus explains what a share does."""
         return []
 
     def is_idle(self, highest_rate: float) -> bool:

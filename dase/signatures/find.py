@@ -31,8 +31,9 @@ from dase.signatures.flicker import find_flicker
 from dase.signatures.frame_coupling import BurstClock, doubt_faint_bursts, find_frame_coupling
 from dase.signatures.full_bus import find_even_bus, find_full_bus
 from dase.signatures.hot_pixels import CalmCounts, find_hot_pixels
-from dase.signatures.kinds import GROUPING
+from dase.signatures.kinds import FLICKER, GROUPING
 from dase.signatures.opposite_pairs import PairCounts, find_opposite_pairs
+from dase.signatures.rate_limit import EventTimes, find_rate_limit
 from dase.signatures.result import Signature, Signatures, without_answer
 from dase.signatures.row_grouping import GroupCounts, find_grouping
 from dase.signatures.time_stamps import StampSettings, find_time_stamps
@@ -40,7 +41,7 @@ from dase.signatures.time_stamps import StampSettings, find_time_stamps
 Source = Recording | Sequence | Events | str | PathLike[str]
 Progress = Callable[[int], object]
 
-COUNT = 9
+COUNT = 10
 """Signatures that are tested, for the correction."""
 
 ROWS_IN_TURN = 1.5e-3
@@ -75,6 +76,7 @@ class _FirstPass:
     def __init__(self, width: int, height: int):
         self.width, self.height = width, height
         self.clock = ClockCounts(width, height)
+        self.times = EventTimes()
         self.count = 0
         self.pixels = np.zeros(width * height, np.int64)
         self.begin = self.end = 0.0
@@ -94,6 +96,7 @@ class _FirstPass:
         self.count += len(events)
         self.end = float(events.t[-1])
         self.clock.push(events)
+        self.times.push(events)
         self.pixels += np.bincount(row_major_pixels(events), minlength=len(self.pixels))
 
     def first_events(self) -> Events:
@@ -196,6 +199,24 @@ def _find_grouping_beside(rows_in_turn: bool, counts: _SecondPass, level: float)
     return without_answer(GROUPING, reason, p=between.p)
 
 
+def _without_periods(entry: Signature, limit: Signature) -> Signature:
+    """Return a ceiling or a tone as no answer where periods of a limited rate make it.
+
+    Args:
+        entry: Of a full bus, or of flicker.
+        limit: Of the rate, which is there.
+    """
+    if not entry.found:
+        return entry
+    if entry.name == FLICKER:
+        turns = entry.details["frequency"] * limit.details["period"]
+        if round(turns) < 1 or abs(turns - round(turns)) > 0.02:
+            return entry
+    elif "scatter" not in entry.details:
+        return entry  # no two events come close to each other: no limit does that
+    return without_answer(entry.name, "the rate is limited in even periods", p=entry.p)
+
+
 def find_signatures(
     source: Source,
     *,
@@ -268,6 +289,10 @@ def find_signatures(
         hot, hot_pixels = look_for_hot(tick=tick)
     if "faint" in coupling.details and stamps.found:
         coupling = doubt_faint_bursts(coupling, stamps.details.get("step", 0.0), first.clock)
+    limit = find_rate_limit(first.times, int(np.count_nonzero(first.pixels)), each)
+    bus = even_bus or find_full_bus(first.clock, first.first_events(), each, tick)
+    if limit.found:
+        flicker, bus = _without_periods(flicker, limit), _without_periods(bus, limit)
     entries = (
         coupling,
         flicker,
@@ -277,6 +302,7 @@ def find_signatures(
         _find_grouping_beside(rows_in_turn, second, each),
         stamps,
         find_double_events(second.intervals, hot_pixels, each, tick),
-        even_bus or find_full_bus(first.clock, first.first_events(), each, tick),
+        bus,
+        limit,
     )
     return Signatures(width, height, first.count, duration, level, entries)

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 FLICKER = "flicker"
 HOT_PIXELS = "hot pixels"
 FULL_BUS = "full bus"
+RATE_LIMIT = "rate limit"
 TIME_STAMPS = "time stamps"
 OPPOSITE_PAIRS = "opposite pairs"
 FIXED_PATTERN = "fixed pattern"
@@ -69,6 +70,7 @@ KINDS: dict[str, SignatureKind] = {
         ),
         SignatureKind(name=HOT_PIXELS, about="some pixels send far more than their neighbours", denies=True),
         SignatureKind(name=FULL_BUS, about="the event rate has a ceiling, or events keep a distance in time"),
+        SignatureKind(name=RATE_LIMIT, about="in even periods never more than so many events pass"),
         SignatureKind(
             name=TIME_STAMPS,
             about="times are multiples of a step or those of packets, or lines of pixels are read in turn",

@@ -25,7 +25,7 @@ from perf.experiments.signatures import run as experiment
 
 NAMES = (
     "frame coupling", "flicker", "hot pixels", "opposite pairs", "fixed pattern", "grouping", "time stamps",
-    "double events", "full bus",
+    "double events", "full bus", "rate limit",
 )  # fmt: skip
 
 
