@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 
 from dase.events import Events
@@ -60,10 +61,28 @@ def follow_the_light(
     """
     places = np.array(entry.details["pixels"], np.int64).reshape(-1, 2)
     places = places[:: -(-len(places) // settings.pixels) or 1]
-    times = scene.sample_times()[: settings.instants]
-    if not len(places) or len(times) < 3:
+    if not len(places):
         return False
-    pixels = places[:, 1] * events.width + places[:, 0]
+    more = gain_by_following(places[:, 1] * events.width + places[:, 0], events, scene, settings)
+    return bool(np.mean(more > settings.sure) >= settings.most)
+
+
+def gain_by_following(
+    pixels: NDArray[np.int64], events: Events, scene: Scene, settings: LedPixelSettings = LED_PIXELS
+) -> NDArray[np.float64]:
+    """Return how much more likely events of pixels are by changes of the light than by the time, shape (N,).
+
+    The logarithm of it; 0 where light never changes, or always as fast.
+
+    Args:
+        pixels: Row-major, shape (N,).
+        events: Of the sensor.
+        scene: Its light, known at all times.
+        settings: How they are compared.
+    """
+    times = scene.sample_times()[: settings.instants]
+    if not len(pixels) or len(times) < 3:
+        return np.zeros(len(pixels))
     light = log_light_of(scene, times, pixels.astype(np.int32), log_eps=settings.log_eps)
     steps = np.diff(times)
     change = np.abs(np.diff(light, axis=0)) / steps[:, None]
@@ -79,4 +98,4 @@ def follow_the_light(
     known = (at >= 0) & (events.t >= times[0]) & (events.t < times[-1])
     step = np.searchsorted(times, events.t[known], side="right") - 1
     more = np.bincount(at[known], gain[step, at[known]], minlength=len(pixels))
-    return bool(np.mean(more > settings.sure) >= settings.most)
+    return more.astype(np.float64)

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from dase.diagnosis.busy_pixels import find_busy_pixels
 from dase.diagnosis.doubles_of_jumps import find_doubles_at_small_jumps
 from dase.diagnosis.frames_at_rest import events_where_frames_rest
 from dase.diagnosis.late_doubles import find_late_doubles
@@ -28,6 +29,7 @@ from dase.events import Events
 from dase.fitting.burst_strength import BurstStrength, burst_times_of, fit_bursts
 from dase.fitting.frame_steps import clip_step_of, frame_step_of, is_held, is_in_step, ticks_are_of_frames
 from dase.fitting.measurement import Measurement
+from dase.fitting.time_window import is_constant
 from dase.results import DetectionLimit, Diagnosis, Estimate, Finding, Grade
 from dase.scenes.between_frames import CameraScene
 from dase.scenes.scene import Scene
@@ -50,7 +52,7 @@ from dase.signatures.kinds import (
     TIME_STAMPS,
     UNEQUAL_THRESHOLDS,
 )
-from dase.signatures.result import Answer, Signature
+from dase.signatures.result import Answer, Signature, Signatures
 from dase.simulation.sensor import Sensor
 from dase.simulation.simulate import simulate
 
@@ -394,7 +396,29 @@ def find_seen_effects(measurement: Measurement, library: Mapping[str, type[Effec
         if begins is None:
             bursts = bursts.extend(float(events.t[-1]))
     absent = tuple(entry for entry in found.entries if entry.answer is Answer.NOT_SEEN)
-    return SeenEffects(entries, bursts, absent, library)
+    return _with_busy_pixels(SeenEffects(entries, bursts, absent, library), events, scene, found)
+
+
+def _with_busy_pixels(seen: SeenEffects, events: Events, scene: Scene, found: Signatures) -> SeenEffects:
+    """Return what is seen, with hot pixels that their light tells where events alone do not.
+
+    A lamp and bursts make pixels send that the scene does not know of, and noise of low thresholds looks
+    alike. Between a camera's frames light is a guess.
+
+    Args:
+        seen: By events alone.
+        events: Of the measurement.
+        scene: What the camera saw.
+        found: All signatures, those that are of the scene among them.
+    """
+    unknown = any(found[name].found for name in (HOT_PIXELS, FLICKER, FRAME_COUPLING, OPPOSITE_PAIRS))
+    if unknown or isinstance(scene, CameraScene) or is_constant(scene):
+        return seen
+    busy = find_busy_pixels(events, scene, found.level / len(found.entries))
+    if not busy.found:
+        return seen
+    absent = tuple(one for one in seen.absent if one.name != HOT_PIXELS)
+    return replace(seen, entries=(*seen.entries, busy), absent=absent)
 
 
 def _is_of_frames(entry: Signature, step: float, events: Events, scene: Scene) -> bool:
