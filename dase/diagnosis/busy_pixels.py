@@ -87,9 +87,7 @@ class BusyPixelSettings:
 BUSY_PIXELS = BusyPixelSettings()
 
 
-def find_busy_pixels(
-    events: Events, scene: Scene, level: float, settings: BusyPixelSettings = BUSY_PIXELS
-) -> Signature:
+def find_busy_pixels(events: Events, scene: Scene, settings: BusyPixelSettings = BUSY_PIXELS) -> Signature:
     """Return the signature of hot pixels amid others whose light changes, see `BusyPixelSettings`.
 
     The null is a Poisson law of the most that light can make: that of the neighbours, as much more as the
@@ -98,7 +96,6 @@ def find_busy_pixels(
     Args:
         events: Of the whole sensor.
         scene: Its light, known at all times.
-        level: p below which it is there.
         settings: What counts.
     """
     size = events.width * events.height
@@ -125,7 +122,7 @@ def find_busy_pixels(
     alone = len(pixels) - nearly >= settings.apart * nearly and len(hot) <= settings.share * size
     chance = np.sort(stats.poisson.sf(sent[hot] - 1, by_light[hot]))
     p = min(1.0, size * float(chance[settings.least - 1])) if len(hot) >= settings.least else 1.0
-    found = len(hot) if alone and p < settings.chance else 0
+    found = len(hot) if alone else 0
     busiest = int(hot[sent[hot].argmax()]) if len(hot) else 0
     rate = float(sent[busiest]) / duration
     entry = Signature(
@@ -138,7 +135,9 @@ def find_busy_pixels(
             "busiest": rate,
         },
     )  # fmt: skip
-    return judge_signature(entry, level, "no pixels send more than light makes their neighbours send")
+    return judge_signature(
+        entry, settings.chance, "no pixels send more than light makes their neighbours send"
+    )
 
 
 def _sends_at_any_time(

@@ -75,6 +75,10 @@ TICKS_LATE = 1.5
 FRAMES_STAMPED = 0.5
 """Share of the frames of a clip at whose times packets are, from which on these are the frames."""
 
+ROUNDED_APART = 0.3
+"""Resultant of the phases within a tick at which frames lie, below which stamps at its multiples are of a
+clock: 1 of a simulator whose stamps are as late after each, 0 of frames that know nothing of the clock."""
+
 ABOVE_CEILING = 4.0
 """Times a ceiling of the rate of events at which a bus must have nothing to do for it to be no bus's."""
 
@@ -411,10 +415,12 @@ def _with_busy_pixels(seen: SeenEffects, events: Events, scene: Scene, found: Si
         scene: What the camera saw.
         found: All signatures, those that are of the scene among them.
     """
-    unknown = any(found[name].found for name in (HOT_PIXELS, FLICKER, FRAME_COUPLING, OPPOSITE_PAIRS))
-    if unknown or isinstance(scene, CameraScene) or is_constant(scene):
+    known = {entry.name for entry in found.found}
+    if known & {HOT_PIXELS, FLICKER, FRAME_COUPLING, OPPOSITE_PAIRS}:
         return seen
-    busy = find_busy_pixels(events, scene, found.level / len(found.entries))
+    if isinstance(scene, CameraScene) or is_constant(scene):
+        return seen
+    busy = find_busy_pixels(events, scene)
     if not busy.found:
         return seen
     absent = tuple(one for one in seen.absent if one.name != HOT_PIXELS)
@@ -428,7 +434,7 @@ def _is_of_frames(entry: Signature, step: float, events: Events, scene: Scene) -
     are in bursts: a simulator that knows these frames alone sends no others.
     """
     if entry.name == TIME_STAMPS and is_held(scene):
-        return True
+        return not _are_rounded(entry.details.get("step", 0.0), events, scene)
     if entry.name == FRAME_COUPLING:
         return step > 0 and is_in_step(1 / entry.details["interval"], step)
     if "packets" in entry.details:
@@ -439,6 +445,22 @@ def _is_of_frames(entry: Signature, step: float, events: Events, scene: Scene) -
         return True  # of noise that is drawn once a frame, or of pixels that send some time after each
     tick = said.get("step", period)
     return ticks_are_of_frames(tick, step, events, scene)
+
+
+def _are_rounded(tick: float, events: Events, scene: Scene) -> bool:
+    """Return whether stamps of held frames come at all times within a tick [s] about these: by a clock.
+
+    Those of a simulator come as long after each frame as after any other.
+    """
+    times = scene.frame_times() if isinstance(scene, VideoScene) else scene.sample_times()
+    if not tick:
+        return False
+    stamps = np.unique(events.t)
+    stamps = stamps[(stamps > times[0]) & (stamps < times[-1])]
+    after = np.searchsorted(times, stamps + 0.5 * tick, side="right") - 1
+    late = (stamps - times[after]) / tick
+    together = float(np.abs(np.exp(2j * np.pi * late).mean())) if len(late) else 1.0
+    return together < ROUNDED_APART
 
 
 def times_that_are_stamps(events: Events, scene: Scene) -> float:

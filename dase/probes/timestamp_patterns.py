@@ -41,6 +41,9 @@ class PatternSettings:
     ticked: int = 1_000_000
     """Events in which ticks are looked for: of a slow clock, thousands of events share one."""
 
+    gaps: int = 50
+    """Gaps between stamps that differ, at most, where their common divisor is looked at."""
+
     in_turns: float = 0.8
     """Least share of events one step behind the one before that tells a bus from a clock, which has at most
     0.41 of them by chance."""
@@ -158,8 +161,27 @@ def clock_period(t: NDArray[np.float64]) -> float:
         return 0.0
     step = float(np.quantile(gaps, 0.02))
     step = refine_period(t, step)
-    regular = is_certain(t, step) and spread_over(t, step)
+    if not is_certain(t, step):
+        step = common_divisor(gaps)
+    regular = step > 0 and is_certain(t, step) and spread_over(t, step)
     return step if regular and not in_turns(t, step) else 0.0
+
+
+def common_divisor(gaps: NDArray[np.float64]) -> float:
+    """Return the time of which all gaps are multiples [s], where these are few; 0 where there is none.
+
+    Where events come together, as those of a simulator do at each frame, no gap between stamps may be as
+    short as a tick of the clock.
+
+    Args:
+        gaps: Between successive stamps [s], shape (N,).
+    """
+    each = np.unique(np.rint(gaps / PATTERNS.file_step).astype(np.int64))
+    if not 2 <= len(each) <= PATTERNS.gaps:
+        return 0.0
+    step = int(np.gcd.reduce(each))
+    told = step > 1 and step < each[0] and np.diff(each).min() == step
+    return step * PATTERNS.file_step if told and step * PATTERNS.file_step > PATTERNS.shortest else 0.0
 
 
 def in_turns(t: NDArray[np.float64], step: float) -> bool:

@@ -15,7 +15,6 @@ from dase.scenes.video import VideoScene
 from dase.signatures.kinds import HOT_PIXELS
 from perf.experiments.signatures.run import draw_scene
 
-LEVEL = 1e-5
 BARE = dase.Sensor().with_effect(EFFECTS["threshold"](on=0.2, off=0.22))
 
 
@@ -48,12 +47,12 @@ def test_hot_pixels_show_amid_others_that_send(scene):
     counts = np.bincount(plain.y.astype(int) * plain.width + plain.x, minlength=plain.width * plain.height)
     places = np.array([[20, 15], [60, 40], [100, 70], [90, 20]])
     rate = 4 * max(counts.mean(), 20) / 0.7
-    entry = find_busy_pixels(with_hot(plain, rng, places, rate), scene, LEVEL)
+    entry = find_busy_pixels(with_hot(plain, rng, places, rate), scene)
     assert entry.found
     assert entry.details["pixels"] == sorted(places.tolist(), key=lambda place: place[1] * 120 + place[0])
-    assert not find_busy_pixels(plain, scene, LEVEL).found
+    assert not find_busy_pixels(plain, scene).found
     # two may be spots
-    assert not find_busy_pixels(with_hot(plain, rng, places[:2], rate), scene, LEVEL).found
+    assert not find_busy_pixels(with_hot(plain, rng, places[:2], rate), scene).found
 
 
 @pytest.mark.parametrize(
@@ -65,7 +64,7 @@ def test_hot_pixels_show_amid_others_that_send(scene):
     ],
 )
 def test_thresholds_that_differ_are_no_hot_pixels(scene, effects):
-    assert not find_busy_pixels(events_of(scene, 32, **effects), scene, LEVEL).found
+    assert not find_busy_pixels(events_of(scene, 32, **effects), scene).found
 
 
 def test_pixels_that_send_with_their_light_are_not_hot(scene):
@@ -78,7 +77,7 @@ def test_pixels_that_send_with_their_light_are_not_hot(scene):
         for n in range(1, 9)
     ]
     both = Events.concatenate([plain, *later])
-    assert not find_busy_pixels(both.select(np.argsort(both.t, kind="stable")), scene, LEVEL).found
+    assert not find_busy_pixels(both.select(np.argsort(both.t, kind="stable")), scene).found
 
 
 def test_a_diagnosis_knows_them_where_events_alone_say_nothing():
