@@ -79,6 +79,9 @@ ROUNDED_APART = 0.3
 """Resultant of the phases within a tick at which frames lie, below which stamps at its multiples are of a
 clock: 1 of a simulator whose stamps are as late after each, 0 of frames that know nothing of the clock."""
 
+MAKERS = 2
+"""Effects that are known to make what is seen, up to which they are said: either this or that one."""
+
 ABOVE_CEILING = 4.0
 """Times a ceiling of the rate of events at which a bus must have nothing to do for it to be no bus's."""
 
@@ -244,7 +247,7 @@ class SeenEffects:
                 continue
             named_here = self.named_by(entry)
             if not named_here:
-                out = self._with_only_maker(entry, out)
+                out = self._with_few_makers(entry, out)
             for name in named_here or (entry.name,):
                 others = two_poles.get(name, ())
                 doubtful = bool(entry.details.get("doubtful", False))
@@ -293,8 +296,8 @@ class SeenEffects:
         told = {kinds[name].by for name in seen if name in kinds}
         return dict.fromkeys(seen, fitted) if fitted and told == {"pole", "delay"} else {}
 
-    def _with_only_maker(self, entry: Signature, findings: list[Finding]) -> list[Finding]:
-        """Return findings with the only effect that is known to make what is seen, or what is not known.
+    def _with_few_makers(self, entry: Signature, findings: list[Finding]) -> list[Finding]:
+        """Return findings with one of the few effects known to make what is seen, or what is not known.
 
         Args:
             entry: What is seen, which names no effect.
@@ -303,7 +306,7 @@ class SeenEffects:
         makers = tuple(makers_of(entry.name, self._known))
         offered = {name for one in findings for name in one.alternatives if one.grade is Grade.EITHER}
         offered |= {one.effect for one in findings if one.grade is Grade.EITHER}
-        if len(makers) != 1 or makers[0] not in self.library or makers[0] in offered:
+        if len(makers) > MAKERS or not set(makers) <= set(self.library) or set(makers) & offered:
             return findings
         return self._with_either(entry, findings)
 

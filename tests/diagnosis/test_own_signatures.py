@@ -73,14 +73,21 @@ def test_what_it_explains_is_not_said_again():
         assert given == said[1:]
 
 
-def test_the_only_one_that_makes_a_pattern_is_offered():
+def test_the_few_that_make_a_pattern_are_offered():
     entry = entry_of("fixed pattern")
     offered, certain = SeenEffects((entry,)).findings([], ())
     assert (offered.effect, offered.grade, offered.unknown) == ("mismatch", Grade.EITHER, True)
     assert (certain.effect, certain.grade) == ("fixed pattern", Grade.CERTAIN)
-    # of two nothing tells which, and what is offered already is not offered twice
-    two = SeenEffects((entry,), library=EFFECTS | own_beside(makes=(Makes("fixed pattern"),)))
-    assert [one.effect for one in two.findings([], ())] == ["fixed pattern"]
+    # of two it is one, of three nothing tells which, and what is offered already is not offered twice
+    two = EFFECTS | own_beside(makes=(Makes("fixed pattern"),))
+    offered, certain = SeenEffects((entry,), library=two).findings([], ())
+    assert {offered.effect, *offered.alternatives} == {"mismatch", "own"}
+    assert (offered.grade, offered.unknown, certain.effect) == (Grade.EITHER, False, "fixed pattern")
+    three = two | {"other": own_beside(makes=(Makes("fixed pattern"),))["own"]}
+    assert [one.effect for one in SeenEffects((entry,), library=three).findings([], ())] == ["fixed pattern"]
+    rows = SeenEffects((entry_of("grouping"),)).findings([], ())
+    assert {rows[0].effect, *rows[0].alternatives} == {"readout", "row_scan"}
+    assert (rows[0].grade, rows[1].effect, rows[1].grade) == (Grade.EITHER, "grouping", Grade.CERTAIN)
     beside = Finding("jitter", Grade.EITHER, ("mismatch",))
     assert SeenEffects((entry,)).findings([beside], ())[:-1] == [beside]
 
