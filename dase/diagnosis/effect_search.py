@@ -28,6 +28,7 @@ from dase.diagnosis.effect_pairs import add_pair
 from dase.diagnosis.exchange import exchange_effects
 from dase.diagnosis.frame_memory import forgets_at_frames
 from dase.diagnosis.held_frames import known_at_frames_alone, low_pass_of
+from dase.diagnosis.pole_and_delay import put_pole_and_delay
 from dase.diagnosis.pruning import prune_model
 from dase.diagnosis.ranking import rank_of
 from dase.diagnosis.redrawn_thresholds import EFFECT as JITTER
@@ -97,6 +98,10 @@ def search_effects(
         if model is not whole and not leaves_nothing(judgement) and not state.path.has_asked(model):
             # a stand-in that was dropped may have hidden what it stood for
             model, judgement = _add_one_by_one(state, compared, model, _left_to_add(task, model, most))
+    whole = model
+    model, judgement = put_pole_and_delay(state, model, judgement)
+    if model is not whole:
+        model, judgement = prune_model(task, state.path, model, judgement)
     model, judgement = exchange_effects(state, model, judgement)
     model, judgement = _fit_beyond_the_search(task, model, judgement)
     state.other_scene = _known_at_frames(state, compared, model, judgement)

@@ -149,6 +149,9 @@ class ExchangeSettings:
     fitted: int = 3
     """Effects that are fitted to all pixels in the place of another, at most."""
 
+    pole_and_delay: float = 0.7
+    """Error that a pole and a delay leave, in units of that of two poles, to take the place of these."""
+
 
 @dataclass(frozen=True)
 class GradeSettings:
