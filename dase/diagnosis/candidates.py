@@ -23,6 +23,7 @@ from dase.fitting.model import (
     places_around,
     places_between,
     places_in_uneven_light,
+    places_of_as_many_events,
     refit_work,
     shift_periodic_effects,
     starting_places,
@@ -35,6 +36,9 @@ from dase.probes.distance import ErrorScale, Judgement
 from dase.probes.random_streams import SimulationStream
 
 Array = NDArray[np.float64]
+
+LIT_PIXELS = 64
+"""Whose light tells how much of its swing an effect leaves."""
 
 Split = TypeVar("Split", bound=SplitMeasurement)
 
@@ -184,7 +188,10 @@ def screen_effect(
     few = half.slow(model.space)
     # most candidates are nothing: the finalists alone are sampled as finely as they need
     most = samples_of_screening(present.sensor, half.frame.step)
-    starts = starting_places(model, effect, few=few)
+    lit = half.trials.stimulus
+    light = lit.intensity[:: max(1, len(lit.pixels) // LIT_PIXELS)] + np.float64(lit.log_eps)
+    along = places_of_as_many_events(model, effect, light)
+    starts = np.concatenate([starting_places(model, effect, few=few), along])
     places, losses = yield from ranking_work(half, model.space, starts, seed=seed, most=most)
     between = places_between(model, effect, places[0])
     if len(between) and not few:

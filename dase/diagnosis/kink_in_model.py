@@ -1,6 +1,7 @@
-"""The kink of a response that events show, in the model before the search and in what a diagnosis says.
+"""A kink and darker corners that events show, in the model before the search and in what a diagnosis says.
 
-It is a simulator's own, known to the last digit, and hides what else steps in the dark would tell.
+The kink is a simulator's own, known to the last digit, and hides what else steps in the dark would tell. How
+much light is lost at the corners no error tells as well: a change of log intensity is the same in less light.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+from dase.diagnosis.alike_steps import find_alike_steps
 from dase.diagnosis.compared_measurement import ComparedMeasurement
 from dase.diagnosis.grading import judge_on_report
 from dase.diagnosis.kinked_response import find_kinked_response
@@ -17,13 +19,13 @@ from dase.effects.linlog import Linlog
 from dase.effects.vignetting import Vignetting
 from dase.fitting.model import FittedModel, refit_model, with_fixed_effect
 from dase.results import Diagnosis, Estimate
-from dase.signatures.kinds import KINK_AT_CORNERS, KINKED_RESPONSE
+from dase.signatures.kinds import CURRENT_AT_CORNERS, KINK_AT_CORNERS, KINKED_RESPONSE
 from dase.signatures.result import Signature
 
 
 @dataclass(frozen=True, eq=False)
 class KinkInModel:
-    """A kink and what makes it.
+    """A kink or darker corners, and what makes them.
 
     Args:
         seen: What shows it.
@@ -38,7 +40,7 @@ class KinkInModel:
     without: tuple[FittedModel, ...]
 
     def added_to(self, found: Diagnosis, task: DiagnosisTask) -> Diagnosis:
-        """Return a diagnosis, made with the kink in its model, with what it is and the error before it.
+        """Return a diagnosis, made with these in its model, with what they are and the error before each.
 
         Args:
             found: By the search.
@@ -68,7 +70,7 @@ class KinkInModel:
 def put_kink_in_model(
     state: DiagnosisState, compared: ComparedMeasurement, model: FittedModel
 ) -> tuple[FittedModel, KinkInModel | None]:
-    """Return a model with the kink of its response that events show, fitted, and that; None without one.
+    """Return a model with what events show of response and corners, fitted, and that; None without any.
 
     Args:
         state: Counts what makes it among what the model has before the search.
@@ -79,6 +81,9 @@ def put_kink_in_model(
     if task.evidence.contradiction or compared.seen.lamp or Linlog.name in task.given:
         return model, None
     found = find_kinked_response(compared.measurement, model.sensor, seed=task.seed)
+    if not found and not compared.seen.stamped_late and Vignetting.name not in task.given:
+        alike = find_alike_steps(compared.measurement, model.sensor, seed=task.seed)
+        found = () if alike is None else alike.at_corners()
     makers = [(effect, told) for effect, told in _makers(found) if effect.name in task.effects]
     if not makers:
         return model, None
@@ -92,7 +97,7 @@ def put_kink_in_model(
 
 
 def _makers(found: Sequence[Signature]) -> list[tuple[Linlog | Vignetting, dict[str, Estimate]]]:
-    """Return the effects that make a kink that was found, each with its parameters."""
+    """Return the effects that make what was found, each with its parameters."""
     out = list[tuple[Linlog | Vignetting, dict[str, Estimate]]]()
     for one in found:
         told = Estimate(one.size, one.low, one.high)
@@ -100,6 +105,6 @@ def _makers(found: Sequence[Signature]) -> list[tuple[Linlog | Vignetting, dict[
             slope = math.log(255 * one.size)
             known = {f"{Linlog.name}.knee": told, f"{Linlog.name}.slope": Estimate(slope, slope, slope)}
             out.append((Linlog(knee=one.size, slope=slope), known))
-        elif one.name == KINK_AT_CORNERS:
+        elif one.name in (KINK_AT_CORNERS, CURRENT_AT_CORNERS):
             out.append((Vignetting(loss=one.size), {f"{Vignetting.name}.loss": told}))
     return out

@@ -12,6 +12,7 @@ from dataclasses import replace
 
 from scipy import stats
 
+from dase.diagnosis.alike_steps import find_alike_steps
 from dase.diagnosis.dead_time import EFFECT as REFRACTORY
 from dase.diagnosis.dead_time import add_dead_time, find_dead_time
 from dase.diagnosis.doubles_of_jumps import JUMPS
@@ -291,6 +292,9 @@ def _look_at_steps_in_the_dark(
     if task.given.intersection(MAKERS_OF_DARK_STEPS):
         return seen
     found = find_larger_steps_in_the_dark(measurement, model.sensor, seed=task.seed)
+    if found is None:
+        alike = find_alike_steps(measurement, model.sensor, seed=task.seed)
+        found = None if alike is None else alike.in_the_dark()
     return seen if found is None else replace(seen, entries=(*seen.entries, found))
 
 

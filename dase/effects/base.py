@@ -369,6 +369,18 @@ class Effect:
         """
         return ()
 
+    def swing_left(self, light: NDArray[np.float64]) -> float:
+        """Return the share of the changes of log light that this effect leaves to pixels.
+
+        So much lower are the thresholds at which as many events come as without it: where this effect is
+        tried, a search begins there, too.
+
+        Args:
+            light: Intensities, and what is added before the logarithm, of some pixels on a grid of time,
+                shape (N, T).
+        """
+        return 1.0
+
     def otherwise(self, beside: Sequence[Effect]) -> list[Self]:
         """Return this effect by the other rules that a fit has to try, too, as no descent gets there.
 

@@ -6,11 +6,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar, Self
 
+import numpy as np
 import warp as wp
+from numpy.typing import NDArray
 
 from dase.effects.base import Effect, Observations, choice, parameter
 from dase.effects.made_signatures import Makes
 from dase.kernels.vector_math import exponential
+
+Array = NDArray[np.float64]
 
 
 @wp.func
@@ -102,6 +106,16 @@ class Dark(Effect):
         ]  # fmt: skip
         share = next((share for share in shares if share < 0.5), None)
         return {} if share is None else {"current": share / (1 - share)}
+
+    def swing_left(self, light: Array) -> float:
+        """Return the share of the changes of log light that are left beside the current.
+
+        Args:
+            light: Intensities, and what is added before the logarithm, of some pixels on a grid of time,
+                shape (N, T).
+        """
+        without, beside = (float(np.abs(np.diff(np.log(light + more))).sum()) for more in (0.0, self.current))
+        return beside / without if without > 0 else 1.0
 
     def lends(self) -> tuple[str, ...]:
         """Return the current, which poles, latency and noise of the voltage follow."""

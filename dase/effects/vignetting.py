@@ -54,7 +54,10 @@ class Vignetting(Effect):
     name: ClassVar[str] = "vignetting"
     source: ClassVar[str] = "Goldman, Chen: Vignette and exposure calibration and compensation, 2005"
     stages: ClassVar = {"light": vignetted_light}
-    signatures: ClassVar = (Makes("kink at the corners", tells=True, absence=False),)
+    signatures: ClassVar = (
+        Makes("kink at the corners", tells=True, absence=False),
+        Makes("current at the corners", tells=True, absence=False),
+    )
     screen_limits: ClassVar = {
         "": (
             "vignetting cannot be told from a screen that is darker at its corners: an evenly lit sheet "

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, fields, replace
 from itertools import product
@@ -501,17 +502,22 @@ def _in_step(sensor: Sensor, effect: Effect) -> Sensor:
     return sensor
 
 
-def starting_places(model: FittedModel, effect: Effect, *, few: bool = False) -> Array:
+def starting_places(
+    model: FittedModel, effect: Effect, *, few: bool = False, shifts: Sequence[float] | None = None
+) -> Array:
     """Return places from which an effect is tried: its strength and its character, at several thresholds.
 
     Args:
         model: With the effect, at its present place.
         effect: What is tried.
         few: Whether fewer places do.
+        shifts: Of the logarithm of the thresholds; None for those that most effects need.
 
     Returns:
         M places, shape (M, P).
     """
+    if shifts is None:
+        shifts = STARTS.shifts
     axes = model.space.axes
     others = [e for e in model.space.sensor.effects if e.name != effect.name]
     known = {f"{effect.name}.{name}": value for name, value in effect.stood_in_for(others).items()}
@@ -526,7 +532,7 @@ def starting_places(model: FittedModel, effect: Effect, *, few: bool = False) ->
     thresholds = [n for n, axis in enumerate(axes) if axis.is_threshold]
     out = []
     for combination in product(*choices):
-        for shift in STARTS.shifts[1::2] if few and not observed else STARTS.shifts:
+        for shift in shifts[1::2] if few and not observed else shifts:
             place = model.place.copy()
             place[columns] = combination
             place[thresholds] += shift
@@ -561,6 +567,36 @@ def places_in_uneven_light(model: FittedModel, effect: Effect, places: Array) ->
                 place[n] = float(axis.to_place(value))
             out.append(place)
     return np.reshape(out, (len(out), len(model.place)))
+
+
+def places_of_as_many_events(model: FittedModel, effect: Effect, light: Array) -> Array:
+    """Return places from which an effect is tried at thresholds with which as many events come as without it.
+
+    What lowers contrasts, as a dark current does, fits along a valley: the more of it, the lower the
+    thresholds. It is narrow where many events tell of them, and the steps of thresholds miss it.
+
+    Args:
+        model: With the effect, at its present place.
+        effect: What is tried.
+        light: Intensities, and what is added before the logarithm, of some pixels on a grid of time,
+            shape (N, T).
+
+    Returns:
+        M places, shape (M, P); none where the effect leaves all of the swing.
+    """
+    axes = model.space.axes
+    if effect.swing_left(light) == 1.0:
+        return np.empty((0, len(axes)))
+    thresholds = [n for n, axis in enumerate(axes) if axis.is_threshold]
+    strengths = [n for n, axis in enumerate(axes) if axis.effect is type(effect) and axis.main]
+    places = starting_places(model, effect, shifts=(0.0,))
+    # the valley goes on to the end of what is plausible, and beyond: a descent finds its way along it
+    end = places[:1].copy()
+    end[:, strengths] = [float(axes[n].to_place(axes[n].fact.plausible[1])) for n in strengths]
+    out = np.unique(np.concatenate([places, end]), axis=0)
+    for place in out:
+        place[thresholds] += math.log(model.space.at(place)[effect.name].swing_left(light))
+    return out
 
 
 def places_between(model: FittedModel, effect: Effect, place: Array) -> Array:

@@ -27,6 +27,7 @@ LATE_EVENTS = "late events"
 LARGER_STEPS_IN_THE_DARK = "larger steps in the dark"
 KINKED_RESPONSE = "kinked response"
 KINK_AT_CORNERS = "kink at the corners"
+CURRENT_AT_CORNERS = "current at the corners"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -138,6 +139,12 @@ KINDS: dict[str, SignatureKind] = {
         SignatureKind(
             name=KINK_AT_CORNERS,
             about="that grey lies at more light of the scene the nearer a corner is",
+            beside_model=True,
+            whatever_fits=True,
+        ),
+        SignatureKind(
+            name=CURRENT_AT_CORNERS,
+            about="a current without light is more of the scene's light the nearer a corner is",
             beside_model=True,
             whatever_fits=True,
         ),

@@ -21,6 +21,7 @@ from dase.fitting.model import (
     model_of,
     places_around,
     places_between,
+    places_of_as_many_events,
     refit_model,
     refit_work,
     shift_periodic_effects,
@@ -112,6 +113,30 @@ def test_the_best_start_has_places_half_way_to_its_neighbours():
     # the phase of a lamp goes round, and a bus is seen: neither has a strength along a range
     lit = with_effect_added(model_of(Sensor()), EFFECTS["readout"]())
     assert not len(places_between(lit, EFFECTS["readout"](), lit.place))
+
+
+@pytest.mark.parametrize("seed", [4, 5])
+def test_a_dark_current_is_tried_at_thresholds_with_which_as_many_events_come(seed):
+    """Along the valley that steps of thresholds miss, to the end of what is plausible."""
+    random, times = np.random.default_rng(seed), 1e-3 * np.arange(600)
+    waves = np.sin(2 * np.pi * random.uniform(3, 9, (20, 30, 1)) * times + random.uniform(0, 6, (20, 30, 1)))
+    light = np.exp(waves - random.uniform(0, 3, (20, 30, 1)))
+    scene = dase.VideoScene(np.moveaxis(0.3 * light, -1, 0).astype(np.float32), times)
+    present = model_of(Sensor())
+    sent = len(dase.simulate(scene, present.sensor))
+    effect = EFFECTS["dark"]()
+    model = with_effect_added(present, effect)
+    places = places_of_as_many_events(model, effect, 0.3 * light.reshape(600, -1) + present.sensor.log_eps)
+    made = [model.space.at(place) for place in places]
+    most = max(made, key=lambda one: one["dark"].current)
+    assert most["dark"].current == pytest.approx(0.1)
+    assert most["threshold"].on < 0.8 * present.sensor["threshold"].on
+    for one in made:
+        assert len(dase.simulate(scene, one)) == pytest.approx(sent, rel=0.1)
+    assert len(dase.simulate(scene, most.with_effect(present.sensor["threshold"]))) < 0.8 * sent
+    # what leaves all of the swing has no such places
+    lamp = EFFECTS["flicker"]()
+    assert not len(places_of_as_many_events(with_effect_added(present, lamp), lamp, light.reshape(600, -1)))
 
 
 def test_a_phase_that_looks_no_better_at_the_same_place_is_found(device, monkeypatch):
