@@ -68,8 +68,9 @@ class AlikeStepSettings:
     looked_at: int = 30_000
     """The same for the last ones."""
 
-    current: tuple[float, float] = (0.004, 1.0)
-    """Currents that are looked for, relative to the brightest light."""
+    current: tuple[float, float] = (0.02, 1.0)
+    """Currents that are looked for, relative to the brightest light: some greys of 8 bits, by which steps in
+    the dark are rounded, are none."""
 
     knee: tuple[float, float] = (0.04, 0.8)
     """Knees that are."""
@@ -80,9 +81,10 @@ class AlikeStepSettings:
     losses: tuple[float, float, float] = (0.9, 0.1, 0.02)
     """Of light in the corners that are tried: from 0 to, in steps of, and in steps of about the best."""
 
-    more: float = 1.5
+    more: float = 1.8
     """Times as many steps must be alike with the current: 2.0 and 3.1 in clips of two simulators with one of
-    30 and 10 greys, at most 1.2 in 72 others."""
+    30 and 10 greys, at most 1.2 in 72 others, and 1.7 in a circuit with a dead time whose clip has 8 bits
+    (sealed), with one of 4 greys."""
 
     decided: float = 1.3
     """Times as many as with any knee: 1.8 and 2.4 in these two."""

@@ -18,6 +18,7 @@ from dase.effects.bandwidth import Bandwidth
 from dase.effects.jitter import Jitter
 from dase.effects.latency import Latency
 from dase.effects.refractory import Refractory
+from dase.effects.second_order import SecondOrder
 from dase.effects.timestamp import Timestamp
 from dase.effects.vignetting import Vignetting
 from dase.effects.voltage_noise import VoltageNoise
@@ -168,6 +169,9 @@ def with_jitter_of_events(
 ) -> Diagnosis:
     """Return a diagnosis in which a jitter is certain that its model had before the search.
 
+    Behind a low-pass that was found light has not gone at an event as far as the frame says, and what looks
+    drawn may be that: a small simulator that filters from frame to frame had had one of 51 % (sealed).
+
     Args:
         found: By the search.
         model: Has a jitter that was read off.
@@ -187,12 +191,14 @@ def with_jitter_of_events(
         f"thresholds are drawn anew at each event, with a spread of {spread}: frames lie on either side"
     )
     said = _with_certain(found, effect, sentence, mine)
-    if not noisy:
+    slow = any(one.effect in (Bandwidth.name, SecondOrder.name) for one in found.findings)
+    if not (noisy or slow):
         return said
+    alternatives = (VoltageNoise.name,) if noisy else ()
     return replace(
         said,
         findings=tuple(
-            replace(one, grade=Grade.EITHER, alternatives=(VoltageNoise.name,))
+            replace(one, grade=Grade.EITHER, alternatives=alternatives, unknown=not noisy)
             if one.effect == Jitter.name
             else one
             for one in said.findings

@@ -72,6 +72,15 @@ def test_a_jitter_beside_noise_that_returns_may_be_that(spread, noisy, said):
     assert grades == ({"jitter": said} if said else {})
 
 
+@pytest.mark.parametrize("name", ["bandwidth", "second_order"])
+def test_a_jitter_behind_a_low_pass_that_was_found_may_be_something_else(name):
+    model = dase.Sensor().with_effect(EFFECTS["jitter"](spread=0.3))
+    bare = Diagnosis(model, (), (1.0,), 1.0, 1.0, 1.15, {}, None, ())
+    bare = replace(bare, findings=(Finding(name, Grade.SUPPORTED),))
+    one = next(one for one in with_jitter_of_events(bare, model).findings if one.effect == "jitter")
+    assert (one.grade, one.alternatives, one.unknown) == (Grade.EITHER, (), True)
+
+
 def test_a_reading_that_a_fit_of_a_wrong_model_contradicts_is_in_doubt():
     """A low-pass of 589 Hz was read off a clip that was no held one, whose fit had one of 410 Hz."""
     model = dase.Sensor().with_effect(EFFECTS["bandwidth"](cutoff=410.0))
