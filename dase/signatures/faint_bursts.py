@@ -49,6 +49,13 @@ class FaintBurstSettings:
         3e-3  # [s] for which the folded rate is above half of its height: bursts 1 to 2 ms, scenes 4
     )
     screen: float = 1 / 60  # [s] what comes so often may be a screen that is seen
+    lamps: tuple[float, float] = (100.0, 120.0)
+    """[Hz] Lamps flicker so: where bursts come as often as each second, third, fourth cycle of one, it may be
+    that, to which thresholds of a simulator answer now and then."""
+
+    near_lamp: float = 0.003
+    """Cycles by which their interval may be no whole number of these."""
+
     near_screen: float = 5e-3  # of that, is as often
 
 

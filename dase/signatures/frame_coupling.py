@@ -344,13 +344,17 @@ def _look_for_faint_bursts(
     details = {
         "interval": interval, "phases": {name: 0.25 * interval}, "share": share, "exposure": math.nan,
         "clock": "bursts", "bursts": spans, "begins": begins.tolist(), "row_delay": bursts.delay,
-        "faint": True,
+        "faint": True, "doubtful": any(_is_whole(interval * lamp) for lamp in FAINT.lamps),
     }  # fmt: skip
     entry = Signature(
         name=FRAME_COUPLING, answer=Answer.FOUND, p=bursts.p, size=math.exp(mean), low=math.exp(low),
         high=math.exp(high), unit="times the usual rate", least=1.0, sentence=said, details=details,
     )  # fmt: skip
     return entry, BurstClock(begins, interval, np.array(spans))
+
+
+def _is_whole(cycles: float) -> bool:
+    return abs(cycles - round(cycles)) < FAINT.near_lamp
 
 
 def _with_row_delay(clock: ClockCounts, entry: Signature) -> Signature:

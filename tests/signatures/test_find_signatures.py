@@ -288,6 +288,14 @@ def test_what_lasts_as_long_as_a_scene_is_no_coupling(rng):
     assert not dase.find_signatures(wheel)["frame coupling"].found
 
 
+@pytest.mark.parametrize(("every", "doubtful"), [(0.025, True), (0.04, True), (0.0231, False)])
+def test_faint_bursts_as_often_as_some_cycles_of_a_lamp_may_be_of_it(rng, every, doubtful):
+    usual = anywhere(rng, rng.uniform(0.0, 1.0, 300_000))
+    entry = dase.find_signatures(over([usual, faint_bursts(rng, every, 0.01, 0.0)]))["frame coupling"]
+    assert entry.found
+    assert entry.details["doubtful"] is doubtful
+
+
 def test_faint_bursts_as_often_as_a_screen_shows_pictures_may_be_its_own(rng):
     usual = anywhere(rng, rng.uniform(0.0, 1.0, 300_000))
     assert not dase.find_signatures(over([usual, faint_bursts(rng, 1 / 60, 0.01, 0.005)]))[
