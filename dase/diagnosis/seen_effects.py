@@ -308,7 +308,7 @@ class SeenEffects:
         offered |= {one.effect for one in findings if one.grade is Grade.EITHER}
         if len(makers) > MAKERS or not set(makers) <= set(self.library) or set(makers) & offered:
             return findings
-        return self._with_either(entry, findings)
+        return self._with_either(entry, findings, unknown=True)
 
     def _names(self, name: str) -> bool:
         """Whether a signature was seen and names effects of the library."""
@@ -342,12 +342,15 @@ class SeenEffects:
         # a pole is seen beside a latency
         return frozenset(out) - set(self.effects)
 
-    def _with_either(self, entry: Signature, findings: Sequence[Finding]) -> list[Finding]:
+    def _with_either(
+        self, entry: Signature, findings: Sequence[Finding], *, unknown: bool = False
+    ) -> list[Finding]:
         """Return findings with one of several effects that is there, and that the search has not announced.
 
         Args:
             entry: What shows it.
             findings: In which none of them is announced.
+            unknown: Whether it may be none of them.
         """
         # where it tells of some, others do not make it so, even if those are not in the library
         told = told_by(entry, self._known) or makers_of(entry.name, self.library)
@@ -357,7 +360,11 @@ class SeenEffects:
         nearest = next((one for one in findings if one.effect in kinds), Finding(kinds[0], Grade.EITHER))
         others = tuple(name for name in kinds if name != nearest.effect)
         said = replace(
-            nearest, grade=Grade.EITHER, alternatives=others, unknown=not others, seen=entry.sentence
+            nearest,
+            grade=Grade.EITHER,
+            alternatives=others,
+            unknown=unknown or not others,
+            seen=entry.sentence,
         )
         return [*(one for one in findings if one.effect not in kinds), said]
 
@@ -403,7 +410,9 @@ def find_seen_effects(measurement: Measurement, library: Mapping[str, type[Effec
         if begins is None:
             bursts = bursts.extend(float(events.t[-1]))
     absent = tuple(entry for entry in found.entries if entry.answer is Answer.NOT_SEEN)
-    return _with_busy_pixels(SeenEffects(entries, bursts, absent, library), events, scene, found)
+    seen = SeenEffects(entries, bursts, absent, library)
+    # beside pixels whose events are left out others look busy
+    return seen if measurement.trust is not None else _with_busy_pixels(seen, events, scene, found)
 
 
 def _with_busy_pixels(seen: SeenEffects, events: Events, scene: Scene, found: Signatures) -> SeenEffects:

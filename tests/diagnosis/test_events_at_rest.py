@@ -329,7 +329,8 @@ def test_pairs_are_said_with_the_noise_that_sends_them():
     pairs = Signature(name=OPPOSITE_PAIRS, answer=Answer.FOUND, sentence="pairs")
     (said,) = SeenEffects((pairs, noise)).findings([], ())
     assert said.words() == "either shot or voltage_noise"
-    (said,) = SeenEffects((pairs,)).findings([], ())
+    offered, said = SeenEffects((pairs,)).findings([], ())
+    assert offered.words() == "either voltage_noise or shot or something that is not in the library"
     assert (said.effect, said.grade) == (OPPOSITE_PAIRS, Grade.CERTAIN)
 
 

@@ -82,7 +82,7 @@ def test_the_few_that_make_a_pattern_are_offered():
     two = EFFECTS | own_beside(makes=(Makes("fixed pattern"),))
     offered, certain = SeenEffects((entry,), library=two).findings([], ())
     assert {offered.effect, *offered.alternatives} == {"mismatch", "own"}
-    assert (offered.grade, offered.unknown, certain.effect) == (Grade.EITHER, False, "fixed pattern")
+    assert (offered.grade, offered.unknown, certain.effect) == (Grade.EITHER, True, "fixed pattern")
     three = two | {"other": own_beside(makes=(Makes("fixed pattern"),))["own"]}
     assert [one.effect for one in SeenEffects((entry,), library=three).findings([], ())] == ["fixed pattern"]
     rows = SeenEffects((entry_of("grouping"),)).findings([], ())
