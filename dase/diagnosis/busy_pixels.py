@@ -109,12 +109,9 @@ def find_busy_pixels(events: Events, scene: Scene, settings: BusyPixelSettings =
     duration = max(float(events.t[-1] - events.t[0]), 1e-9)
     if len(pixels):
         pixels = pixels[_sends_at_any_time(pixels, events, scene, settings)]
+    by_light = usual.copy()
     if len(pixels):
-        way = _ways_of_light(scene, settings).reshape(counts.shape)
-        beside = np.maximum(np.nanmedian(_neighbours(way, settings.reach), 0), settings.rest).reshape(-1)
-        by_light = usual * np.maximum(way.reshape(-1) / beside, 1.0)
-    else:
-        by_light = usual
+        by_light[pixels] *= _times_as_much_light(pixels, scene, settings)
     is_hot = (sent >= settings.ratio * usual) & (sent - usual >= settings.more) & (beyond >= settings.errors)
     is_hot &= (sent >= settings.most * third) & (sent >= settings.by_light * by_light)
     hot = pixels[is_hot[pixels]]
@@ -157,13 +154,32 @@ def _sends_at_any_time(
     return out
 
 
-def _ways_of_light(scene: Scene, settings: BusyPixelSettings) -> Array:
-    """Return how far the log intensity of each pixel goes, up and down, shape (H * W,)."""
-    times, size = scene.sample_times(), scene.width * scene.height
-    out = np.empty(size)
-    for first in range(0, size, settings.widest):
-        part = np.arange(first, min(first + settings.widest, size), dtype=np.int32)
-        light = log_light_of(scene, times, part, log_eps=settings.log_eps)
+def _times_as_much_light(pixels: NDArray[np.int64], scene: Scene, settings: BusyPixelSettings) -> Array:
+    """Return how much farther the light of pixels goes than that of their neighbours, 1 at least, shape (N,).
+
+    Only these are looked at: a scene may render all of its pictures for each look.
+    """
+    side = np.arange(-settings.reach, settings.reach + 1)
+    dy, dx = (one.reshape(-1) for one in np.meshgrid(side, side, indexing="ij"))
+    row, column = np.divmod(pixels, scene.width)
+    y, x = row[:, None] + dy, column[:, None] + dx
+    inside = (y >= 0) & (y < scene.height) & (x >= 0) & (x < scene.width)
+    places = np.where(inside, y * scene.width + x, pixels[:, None])
+    needed, back = np.unique(places, return_inverse=True)
+    way = _ways_of_light(needed, scene, settings)[back].reshape(places.shape)
+    middle = len(dy) // 2
+    inside[:, middle] = False
+    beside = np.maximum(np.nanmedian(np.where(inside, way, np.nan), 1), settings.rest)
+    out: Array = np.maximum(way[:, middle] / beside, 1.0)
+    return out
+
+
+def _ways_of_light(pixels: NDArray[np.int64], scene: Scene, settings: BusyPixelSettings) -> Array:
+    """Return how far the log intensity of pixels goes, up and down, shape (N,)."""
+    times, out = scene.sample_times(), np.empty(len(pixels))
+    for first in range(0, len(pixels), settings.widest):
+        part = slice(first, first + settings.widest)
+        light = log_light_of(scene, times, pixels[part].astype(np.int32), log_eps=settings.log_eps)
         out[part] = np.abs(np.diff(light, axis=0)).sum(0)
     return out
 

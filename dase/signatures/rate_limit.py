@@ -31,10 +31,8 @@ class RateLimitSettings:
     least: float = 0.02  # share of the periods that are full
     fewest_full: int = 10
     fewest_events: int = 20  # in a full period: small counts are alike by chance
-    wide: tuple[int, ...] = (
-        0,
-        1,
-    )  # counts about the largest that are as full: some came or went later
+    # counts about the largest that are as full: some came or went later
+    wide: tuple[int, ...] = (0, 1)
     beside: int = 5  # counts below those, for each of them, with which they are compared
     piled: float = 4.0  # times as many as of each of those, at least
     above: float = 0.05  # of the full periods: periods of more that something else may have added to
@@ -87,7 +85,17 @@ class EventTimes:
 
 @dataclass(frozen=True)
 class _Limit:
-    """Periods that are full, and how likely as many are by chance."""
+    """Periods that are full, and how likely as many are by chance.
+
+    Args:
+        log_p: Logarithm of the chance of as many.
+        period: Ticks of each.
+        offset: Of the first, from the first event [ticks].
+        most: Events in a full one.
+        width: By how many it may have more or fewer.
+        full: How many are.
+        periods: How many there are.
+    """
 
     log_p: float
     period: int
