@@ -53,6 +53,10 @@ class ReadingSettings:
     jitter: float = 25e-6
     """[s] At least."""
 
+    about_zero: float = 0.25
+    """Of latencies that are drawn about 0 the medians of bins, relative to the later half, at most: half of
+    all are 0, and as many as that by chance; the sixth of them that come first are."""
+
     even: float = 1.5
     """By how much the early half of the delays may widen with the way: what a low-pass adds does."""
 
@@ -96,6 +100,9 @@ class ReadingSettings:
 
 
 READINGS = ReadingSettings()
+
+AT_ONCE = 1e-6
+"""[s] After a frame, as the stamps of a file tell."""
 
 
 def with_direct_readings(
@@ -216,7 +223,7 @@ def _effects_of(
         return out  # by what groups of pixels differ is not known
     lines = np.array([one.line() for one in groups])
     errors = NINETY * lines.std(axis=0, ddof=1) / math.sqrt(len(groups))
-    apart = _half_apart(delays)
+    apart = _half_apart(delays, settings)
     near = settings.middle * delays.gap
     in_the_middle = abs(late - 0.5 * delays.gap) <= near and apart[0] <= near
     if late >= settings.latency and not in_the_middle:
@@ -226,7 +233,7 @@ def _effects_of(
         out.append((Latency(delay=late, light=0.0), sentence, mine))
     if apart[0] >= settings.jitter and apart.max() <= settings.even * apart.min():
         jitter = float(apart.mean())
-        each = np.array([_half_apart(one).mean() for one in groups])
+        each = np.array([_half_apart(one, settings).mean() for one in groups])
         half = math.hypot(NINETY * float(each.std(ddof=1)) / math.sqrt(len(groups)), settings.known * jitter)
         sentence = f"events of the same frame and the same way to go come {format_seconds(jitter)} apart"
         mine = {"timestamp.jitter": Estimate(jitter, jitter - half, jitter + half)}
@@ -273,15 +280,16 @@ def _vignetting_of(
     return Vignetting(loss=loss), sentence, {"vignetting.loss": Estimate(loss, low, high)}
 
 
-def _half_apart(delays: DelaysAfterFrames, bins: int = 4) -> np.ndarray:
+def _half_apart(delays: DelaysAfterFrames, settings: ReadingSettings, bins: int = 4) -> np.ndarray:
     """Return how far the early events of a bin of short ways lie before its median [s], shape (B,).
 
     Of latencies that are drawn about 0 half are 0, and the late ones tell how far apart they are.
     """
     _, late = delays.quantiles((0.16, 0.5, 0.84))
     early, later = np.diff(late[:bins]).T
-    # medians of bins with some noise are some microseconds, not 0
-    half: np.ndarray = later if early.max() < 0.1 * later.min() else early
+    at_once = late[:bins, 0].max() < AT_ONCE
+    # medians of bins with few events or some noise are some microseconds, not 0
+    half: np.ndarray = later if at_once and early.max() < settings.about_zero * later.min() else early
     return half
 
 

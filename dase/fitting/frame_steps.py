@@ -155,8 +155,9 @@ def _come_at_frames(events: Events, scene: Scene, step: float, settings: FrameSt
     at_frame = np.abs(phase) * step < settings.exact
     if at_frame.mean() < settings.many:
         return False
-    # ticks of a clock have all alike
-    others = np.histogram(phase[~at_frame] % 1.0, 2 * settings.parts, (0.0, 1.0))[0]
+    # ticks of a clock have all alike; the middle between two frames lies in the middle of a part
+    bins = 2 * settings.parts
+    others = np.histogram((phase[~at_frame] + 0.5 / bins) % 1.0, bins, (0.0, 1.0))[0]
     if others.max() * settings.most > np.count_nonzero(at_frame):
         return False
     against = _against_the_light(events.select(at_frame), scene, step, settings)
@@ -217,7 +218,8 @@ def ticks_are_of_frames(
     if not tick or not frame_step or tick > (1 + settings.near) * frame_step:
         return False
     if tick < (1 - settings.near) * frame_step:
-        return True
+        # no part of a frame is at all ticks but for a clock that rounds the times
+        return is_in_step(1 / tick, frame_step)
     against = _against_the_light(events, scene, frame_step, settings)
     return against.before < against.after
 

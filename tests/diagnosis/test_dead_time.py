@@ -151,6 +151,32 @@ def test_a_few_random_events_in_the_dead_time_hide_it_not():
     assert end_of_intervals(many, modelled) is None
 
 
+@pytest.mark.parametrize(("noisy", "told"), [(0.1, True), (0.0, False), (0.5, False)])
+def test_as_many_as_noise_makes_may_be_in_the_dead_time(noisy, told):
+    """v2e sends its noise in a dead time, too."""
+    rng = np.random.default_rng(1)
+    of_light = np.sort(rng.gamma(3.0, 4e-3, 20_000))
+    lost = int(np.searchsorted(of_light, 5e-3))
+    noise = rng.uniform(0, 5e-3, round(noisy / (1 - noisy) * lost))
+    modelled = np.sort(np.concatenate([of_light, noise]))
+    left = rng.uniform(0, 5e-3, round(0.08 * lost))
+    seen = np.sort(np.concatenate([of_light[lost:], left]))
+    assert (end_of_intervals(seen, modelled, of_light) is not None) is told
+    assert end_of_intervals(seen, modelled) is None
+
+
+def test_the_noise_of_a_model_is_left_in_a_dead_time(scene, monkeypatch):
+    sensor = Sensor().with_effect(EFFECTS["shot"](rate=20.0))
+    events = dase.simulate(scene, sensor, seed=1)
+    asked = []
+    monkeypatch.setattr(dead_time, "end_of_intervals", lambda *given, **more: asked.append(given))
+    found(scene, events, sensor)
+    found(scene, events, Sensor())
+    noisy, quiet = asked
+    assert len(noisy[2]) < 0.97 * len(noisy[1])
+    assert quiet[2] is quiet[1]
+
+
 def test_under_a_lamp_more_intervals_must_be_lost(scene, monkeypatch):
     """Of a thousand that are lost among a hundred thousand a pole under a lamp is as likely the cause."""
     rng = np.random.default_rng(1)

@@ -228,6 +228,24 @@ def test_ticks_of_a_simulator_that_knows_frames_alone_are_no_clock(fine_clip, ti
     assert "timestamp" not in find_seen_effects(Measurement(events, fine_clip), EFFECTS).effects
 
 
+@pytest.mark.parametrize(("share", "clock"), [(0.25, False), (0.3125, True)])
+def test_ticks_that_are_no_parts_of_a_frame_are_a_clock(fine_clip, share, clock):
+    """IEBCS with stamps rounded to 625 us, of frames each 2 ms: its clock was taken for the frames."""
+    events = dase.simulate(fine_clip, "ideal", seed=2)
+    tick = share * 1e-3
+    stamped = at_times(events, np.rint(np.ceil(events.t / 1e-3) * 1e-3 / tick) * tick)
+    assert frame_step_of(stamped, fine_clip) == pytest.approx(1e-3)
+    assert ticks_are_of_frames(tick, 1e-3, stamped, fine_clip) is not clock
+
+
+def test_a_clock_that_rounds_to_halves_of_frames_is_one(fine_clip):
+    """Half of the events are then at frames, and go with the light there; the others are at the middle."""
+    events = dase.simulate(fine_clip, "ideal", seed=2)
+    stamped = at_times(events, np.rint(events.t / 0.5e-3) * 500 * 1e-6)
+    assert frame_step_of(stamped, fine_clip) is None
+    assert find_seen_effects(Measurement(stamped, fine_clip), EFFECTS).entry_of("time stamps") is not None
+
+
 def test_a_clock_that_ticks_as_often_as_frames_come_is_one(fine_clip):
     sensor = Sensor().with_effect(EFFECTS["timestamp"](step=1e-3, jitter=0.0))
     events = dase.simulate(fine_clip, sensor, seed=2)
