@@ -14,6 +14,7 @@ from dase.diagnosis.seen_effects import shows_in
 from dase.effects import EFFECTS, Effect
 from dase.effects.made_signatures import makers_of
 from dase.effects.rate_control import RateControl
+from dase.fitting.frame_steps import frame_step_of
 from dase.results import Diagnosis, Estimate, Finding, Grade
 from dase.signatures.find import find_signatures
 from dase.signatures.kinds import RATE_LIMIT
@@ -52,6 +53,14 @@ def with_limit_of_rate(found: Diagnosis, compared: ComparedMeasurement, limit: R
         for name, value in (("rate", limit.rate), ("period", limit.period))
     }
     certain = Finding(limit.name, Grade.CERTAIN, parameters=known, seen=entry.sentence)
+    measurement = compared.measurement
+    if measurement.held or frame_step_of(measurement.events, measurement.scene):
+        # where times between frames are a simulator's own, which events come too late in a period is a guess
+        doubtful = (
+            replace(one, grade=Grade.EITHER, unknown=True) if one.grade is Grade.SUPPORTED else one
+            for one in found.findings
+        )
+        found = replace(found, findings=tuple(doubtful))
     return replace(
         found,
         selected=(*found.selected, limit.name),

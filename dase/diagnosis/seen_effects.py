@@ -79,6 +79,9 @@ ROUNDED_APART = 0.3
 """Resultant of the phases within a tick at which frames lie, below which stamps at its multiples are of a
 clock: 1 of a simulator whose stamps are as late after each, 0 of frames that know nothing of the clock."""
 
+SLOWEST_CLOCK = 1e-3
+"""Ticks above which a readout of all pixels at once is as likely [s]: no plausible clock has any."""
+
 MAKERS = 2
 """Effects that are known to make what is seen, up to which they are said: either this or that one."""
 
@@ -254,7 +257,21 @@ class SeenEffects:
                 grade = Grade.EITHER if others or doubtful else Grade.CERTAIN
                 out = [one for one in out if one.effect != name]
                 out.append(Finding(name, grade, others, doubtful and not others, seen=entry.sentence))
-        return out
+        return [self._or_read_at_once(one) for one in out]
+
+    def _or_read_at_once(self, one: Finding) -> Finding:
+        """Return a finding; of a clock that ticks too slowly for one *either that or a scan*.
+
+        A readout that looks at all pixels at once, from time to time, has the same stamps.
+        """
+        entry = self.entry_of(TIME_STAMPS)
+        step = entry.details.get("step", 0.0) if entry is not None and "packets" not in entry.details else 0.0
+        if entry is None or one.grade is not Grade.CERTAIN or one.effect not in self.named_by(entry):
+            return one
+        scans = tuple(name for name, it in makers_of(TIME_STAMPS, self.library).items() if it.by == "line")
+        if step <= SLOWEST_CLOCK or one.effect in scans or not scans:
+            return one
+        return replace(one, grade=Grade.EITHER, alternatives=scans)
 
     def _is_in_doubt(self, one: Finding) -> bool:
         """Whether events one by one tell of another effect, or that something else makes them late."""

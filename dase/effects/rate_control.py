@@ -76,6 +76,8 @@ class Dropper(SharedReader):
         self._turn, self._before, self._came = int(periods[-1]), float(before[-1]), float(came[-1])
         if self._drop == "last":
             passes = so_far < self._most
+            if len(others.time):
+                self._draw_ties(passes, at[order], each, so_far)
         elif self._drop == "even":
             # a hair more, so that a share of 1 is not less by rounding
             passes = np.floor((so_far + 1) * share + 1e-9) > np.floor(so_far * share + 1e-9)
@@ -84,6 +86,37 @@ class Dropper(SharedReader):
         kept = np.zeros(len(at), np.bool_)
         kept[order] = passes
         return events.select(kept[: len(own)])
+
+    def _draw_ties(
+        self,
+        passes: NDArray[np.bool_],
+        at: NDArray[np.int64],
+        each: NDArray[np.float64],
+        so_far: NDArray[np.float64],
+    ) -> None:
+        """Let chance say which of the events at one time pass where some of them do.
+
+        Else some events would always pass before others, where many are of one time, as those of a frame.
+
+        Args:
+            passes: Which events do, as they are in order; changed in place, shape (N,).
+            at: Their times, ascending [ns], shape (N,).
+            each: How many events each stands for, shape (N,).
+            so_far: How many came before it in its period, shape (N,).
+        """
+        begins = np.flatnonzero(np.diff(at, prepend=at[0] - 1))
+        # only where some of one time pass and others do not
+        mixed = np.logical_or.reduceat(passes, begins) & ~np.logical_and.reduceat(passes, begins)
+        if not mixed.any():
+            return
+        run = np.cumsum(np.diff(at, prepend=at[0]) > 0)
+        some = np.flatnonzero(mixed[run])
+        some = some[np.lexsort((self._random.random(len(some)), run[some]))]
+        before = np.cumsum(each[some]) - each[some]
+        starts = np.flatnonzero(np.diff(run[some], prepend=run[some[0]] - 1))
+        room = self._most - so_far[begins[run[some[starts]]]]
+        length = np.diff(np.append(starts, len(some)))
+        passes[some] = before - np.repeat(before[starts], length) < np.repeat(room, length)
 
 
 @dataclass(frozen=True, kw_only=True)

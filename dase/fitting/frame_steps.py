@@ -69,6 +69,10 @@ class FrameStepSettings:
     near: float = 0.02
     """How far from a frame an event is of it, in steps from frame to frame."""
 
+    drift: float = 0.5
+    """By how many ticks those that are parts of a frame may go from these over all events, at most: rounded
+    stamps tell ticks to much less."""
+
     elsewhere: float = 0.01
     """Share of the events at other times than frames from which on it is asked whether those at a frame tell
     of what comes after it: a clock whose ticks are frames has none."""
@@ -218,8 +222,10 @@ def ticks_are_of_frames(
     if not tick or not frame_step or tick > (1 + settings.near) * frame_step:
         return False
     if tick < (1 - settings.near) * frame_step:
-        # no part of a frame is at all ticks but for a clock that rounds the times
-        return is_in_step(1 / tick, frame_step)
+        # ticks that drift from the frames are of a clock that rounds what is sent at frames
+        ticks = frame_step / tick
+        frames = float(events.t[-1] - events.t[0]) / frame_step
+        return abs(ticks - round(ticks)) * frames < settings.drift
     against = _against_the_light(events, scene, frame_step, settings)
     return against.before < against.after
 

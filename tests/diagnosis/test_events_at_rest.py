@@ -79,6 +79,26 @@ def test_noise_of_the_voltage_takes_turns(scene):
     assert entry.details["returning"] > 0.8
 
 
+@pytest.mark.parametrize(("rate", "told"), [(4.0, ("shot",)), (0.2, ())])
+def test_polarities_at_even_intervals_each_do_not_return(scene, rate, told):
+    """IEBCS's noise: in a short time there is one of each at most, and it was noise of the voltage."""
+    rng = np.random.default_rng(6)
+    one, end = SIDE * SIDE, float(scene.sample_times()[-1])
+    t, pixel, p = [], [], []
+    for sign in (0, 1):
+        turns = np.arange(int(rate * end) + 2)
+        when = (turns + rng.random((one, 1))) / rate
+        t.append(when.ravel())
+        pixel.append(np.repeat(np.arange(one), len(turns)))
+        p.append(np.full(when.size, sign, bool))
+    t, pixel, p = (np.concatenate(part) for part in (t, pixel, p))
+    order = np.flatnonzero(t < end)[np.argsort(t[t < end], kind="stable")]
+    events = Events(t[order], pixel[order] % SIDE, pixel[order] // SIDE, p[order], SIDE, SIDE)
+    entry = found(scene, events)
+    assert entry.name == NOISE_AT_REST
+    assert told_by(entry, EFFECTS) == told
+
+
 def test_few_pairs_do_not_tell_which_noise_it_is(scene):
     entry = found(scene, seen_by(scene, shot=dict(rate=0.4)))
     assert entry.name == NOISE_AT_REST

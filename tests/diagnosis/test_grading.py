@@ -472,6 +472,14 @@ def test_little_that_differs_beside_a_dead_time_is_in_doubt(name, spread, period
     assert not is_too_small(model, "threshold.on", Estimate(0.1, 0.1, 0.1))
 
 
+@pytest.mark.parametrize(("sigma", "in_doubt"), [(4e-3, True), (0.024, False)])
+def test_noise_of_the_voltage_of_which_any_chance_is_as_good_is_in_doubt(sigma, in_doubt):
+    """Beside a limit of the rate, where little decides what is sent: one of 0.004 was supported."""
+    model = model_of(Sensor().with_effect(EFFECTS["voltage_noise"](sigma=sigma)))
+    value = Estimate(sigma, 0.9 * sigma, 1.1 * sigma)
+    assert is_too_small(model, "voltage_noise.sigma", value) is in_doubt
+
+
 @pytest.mark.parametrize("beside", ["bandwidth", "second_order"])
 @pytest.mark.parametrize("name", ["jitter", "mismatch"])
 def test_little_that_differs_beside_a_low_pass_is_in_doubt(name, beside):

@@ -9,7 +9,7 @@ from helpers.frame_simulator import HEIGHT, WIDTH, shaken_texture
 from helpers.held_pixels import held_with_low_pass
 
 import dase
-from dase.diagnosis.held_frames import fewest_frames
+from dase.diagnosis.held_frames import _sentence_of_memory, fewest_frames
 from dase.effects import EFFECTS
 from dase.events import Events
 from dase.fitting.measurement import as_measurement
@@ -79,6 +79,14 @@ def test_thresholds_tell_which_frame_is_the_memory_where_light_is_slow(dead, thr
     slow = shaken_texture(gap=1e-3, length=0.4)
     events = held_with_low_pass(slow, dead=dead, threshold=threshold)
     assert fewest_frames(as_measurement(events, slow)) == frames
+
+
+@pytest.mark.parametrize(("dead", "frames", "told"), [(5e-3, 6, True), (5e-3, 4, False), (0.0, 1, False)])
+def test_thresholds_that_are_alike_tell_of_a_dead_time(dead, frames, told):
+    """It changes little where light is slow: one of IEBCS of 2 ms, of frames each 1.25 ms."""
+    slow = shaken_texture(gap=1e-3, length=0.4)
+    measurement = as_measurement(held_with_low_pass(slow, dead=dead), slow)
+    assert bool(_sentence_of_memory(measurement, frames)) is told
 
 
 @pytest.mark.slow

@@ -228,9 +228,12 @@ def test_ticks_of_a_simulator_that_knows_frames_alone_are_no_clock(fine_clip, ti
     assert "timestamp" not in find_seen_effects(Measurement(events, fine_clip), EFFECTS).effects
 
 
-@pytest.mark.parametrize(("share", "clock"), [(0.25, False), (0.3125, True)])
+@pytest.mark.parametrize(("share", "clock"), [(0.25, False), (0.3125, True), (0.248, True)])
 def test_ticks_that_are_no_parts_of_a_frame_are_a_clock(fine_clip, share, clock):
-    """IEBCS with stamps rounded to 625 us, of frames each 2 ms: its clock was taken for the frames."""
+    """IEBCS with stamps rounded to 625 us, of frames each 2 ms: its clock was taken for the frames.
+
+    So was one of 312 us, of frames each 2.5 ms, which goes from eighths of these by three ticks in a second.
+    """
     events = dase.simulate(fine_clip, "ideal", seed=2)
     tick = share * 1e-3
     stamped = at_times(events, np.rint(np.ceil(events.t / 1e-3) * 1e-3 / tick) * tick)

@@ -18,7 +18,9 @@ from dase.scenes.video import VideoScene
 from dase.simulation.sensor import Sensor
 
 
-def held_frames(scene: VideoScene, *, early: bool, late: float = 0.0, threshold: float = 0.2) -> Events:
+def held_frames(
+    scene: VideoScene, *, early: bool, late: float = 0.0, threshold: float = 0.2, wait: int = 0
+) -> Events:
     """Return events of light that jumps from frame to frame; a pixel that sends forgets the rest of it.
 
     Args:
@@ -26,15 +28,20 @@ def held_frames(scene: VideoScene, *, early: bool, late: float = 0.0, threshold:
         early: Whether a frame is shown from the time of the one before on, or from its own.
         late: From the jump to the event [s]; two microseconds apart from pixel to pixel.
         threshold: ON and OFF [log intensity].
+        wait: Frames that it does not look at after that, the last of which it remembers.
     """
     times = scene.sample_times()
     level = np.log(scene.frames(times) + 1e-3)
     memory, out = level[0].copy(), []
+    dead = np.zeros(memory.shape, int)
     for begin, now in zip(times[:-1] if early else times[1:], level[1:], strict=True):
-        y, x = np.nonzero(np.abs(now - memory) >= threshold)
+        memory = np.where(dead > 0, now, memory)
+        y, x = np.nonzero((np.abs(now - memory) >= threshold) & (dead == 0))
+        dead = np.maximum(dead - 1, 0)
         apart = 1e-6 * np.round(2 * np.random.default_rng(x).uniform(size=len(x)))
         out.append((begin + late + apart, x, y, now[y, x] > memory[y, x]))
         memory[y, x] = now[y, x]
+        dead[y, x] = wait
     t, x, y, p = (np.concatenate(part) for part in zip(*out, strict=True))
     order = np.argsort(t, kind="stable")
     return Events(t[order], x[order], y[order], p[order], WIDTH, HEIGHT)
@@ -164,11 +171,34 @@ def test_latencies_that_are_drawn_about_nothing_tell_of_held_frames_as_well(scen
     order = np.argsort(t, kind="stable")
     spread = Events(t[order], events.x[order], events.y[order], events.p[order], WIDTH, HEIGHT)
     assert holds_frames(spread, scene) is early
-    # at frames, and at any time between: noise that is drawn at each, and light that goes on
+    # at frames, and at any time between: noise that is drawn at each, and light that goes on, unless all of
+    # one threshold of held frames
     t = np.round(events.t / gap) * gap + gap * np.maximum(rng.uniform(-1.0, 1.0, len(events)), 0.0)
     order = np.argsort(t, kind="stable")
     even = Events(t[order], events.x[order], events.y[order], events.p[order], WIDTH, HEIGHT)
+    assert holds_frames(even, scene) is early
+    counted = counted_between_frames(scene, 0.0)
+    t = np.floor(counted.t / gap) * gap + gap * np.maximum(rng.uniform(-1.0, 1.0, len(counted)), 0.0)
+    order = np.argsort(t, kind="stable")
+    even = Events(t[order], counted.x[order], counted.y[order], counted.p[order], WIDTH, HEIGHT)
     assert not holds_frames(even, scene)
+
+
+@pytest.mark.parametrize(("early", "frames"), [(True, 0), (True, 3), (False, 0)])
+def test_noise_at_any_time_hides_no_held_frames_of_one_threshold(scene, early, frames):
+    """Two clips of IEBCS with shot noise, a tenth of the events, and one with a dead time of four frames."""
+    gap, rng = float(np.diff(scene.sample_times())[0]), np.random.default_rng(3)
+    events = held_frames(scene, early=early, wait=frames)
+    count, end = len(events) // 9, float(scene.sample_times()[-1])
+    x, y = (rng.integers(0, size, count) for size in (WIDTH, HEIGHT))
+    noise = Events(np.sort(rng.uniform(0, end, count)), x, y, rng.random(count) < 0.5, WIDTH, HEIGHT)
+    t, x, y, p = (
+        np.concatenate([getattr(one, name) for one in (events, noise)]) for name in ("t", "x", "y", "p")
+    )
+    t[: len(events)] = np.round(events.t / gap) * gap
+    order = np.argsort(t, kind="stable")
+    both = Events(t[order], x[order], y[order], p[order], WIDTH, HEIGHT)
+    assert holds_frames(both, scene) is early
 
 
 def test_few_events_tell_nothing(scene):
