@@ -245,7 +245,8 @@ def end_of_intervals(
         p=float(stats.poisson.cdf(here, there)), size=1 - here / there,
         unit="share of the shorter intervals that are not there", least=1 - left, sentence=sentence,
         details={
-            "period": end, "low": low, "high": end, "shortest": shortest, "here": here, "without": there
+            "period": end, "low": low, "high": end, "shortest": shortest, "here": here, "without": there,
+            "cut_off": is_cut_off(seen, end, settings),
         },
     )  # fmt: skip
 

@@ -118,9 +118,12 @@ def settle_dead_time(
         seen, model, judgement = _without_needless_dead_time(task, seen, measurement, model, judgement)
     ended = seen.entry_of(DEAD_TIME)
     if ended is not None and REFRACTORY in task.effects and REFRACTORY not in model.sensor:
-        model, _ = add_dead_time(task, model, judgement, ended)
+        model, judgement = add_dead_time(task, model, judgement, ended)
         if REFRACTORY not in model.sensor:  # no model has it: what the last one lacks may end intervals so
             seen = seen.with_doubt(DEAD_TIME)
+    if ended is not None and judgement.error > judgement.gate and not ended.details.get("cut_off", True):
+        # a model that lacks something else has other short intervals, and these become rare by and by
+        seen = seen.with_doubt(DEAD_TIME)
     return _without_delays_of_dead_time(task, seen, model), model
 
 

@@ -79,8 +79,8 @@ ROUNDED_APART = 0.3
 """Resultant of the phases within a tick at which frames lie, below which stamps at its multiples are of a
 clock: 1 of a simulator whose stamps are as late after each, 0 of frames that know nothing of the clock."""
 
-SLOWEST_CLOCK = 1e-3
-"""Ticks above which a readout of all pixels at once is as likely [s]: no plausible clock has any."""
+SLOWEST_CLOCK = 1.5e-3
+"""Ticks above which a readout of all pixels at once is as likely [s]: 1 ms is the slowest plausible clock."""
 
 MAKERS = 2
 """Effects that are known to make what is seen, up to which they are said: either this or that one."""
@@ -225,6 +225,8 @@ class SeenEffects:
                 one = replace(
                     one, grade=Grade.EITHER, alternatives=two_poles[one.effect], seen=seen[one.effect]
                 )
+            elif one.effect in self._doubtful:
+                one = replace(one, grade=Grade.EITHER, unknown=True, seen=seen[one.effect])
             elif one.effect in seen:
                 one = Finding(
                     one.effect, Grade.CERTAIN, (), False, one.error_without, one.error_with, one.deviation,

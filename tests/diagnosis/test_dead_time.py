@@ -21,6 +21,7 @@ from dase.fitting.measurement import Measurement
 from dase.fitting.model import model_of
 from dase.probes.distance import Judgement
 from dase.probes.timestamp_patterns import TimestampStructure
+from dase.results import Finding, Grade
 from dase.scenes.video import VideoScene
 from dase.signatures import kinds
 from dase.signatures.result import Answer, Signature
@@ -322,7 +323,7 @@ def test_a_dead_time_that_the_search_has_dropped_is_asked_for_beside_the_last_mo
 
     monkeypatch.setattr(seen_beside_model, "_look_for_dead_time", look)
     monkeypatch.setattr(
-        seen_beside_model, "add_dead_time", lambda task, one, *rest: (added.append(one) or one, None)
+        seen_beside_model, "add_dead_time", lambda task, one, *rest: (added.append(one) or one, judged(0.3))
     )
     seen, _ = seen_beside_model.settle_dead_time(
         task, EventsAlone(), SeenEffects((entry,)), None, model, judged(0.3)
@@ -333,6 +334,34 @@ def test_a_dead_time_that_the_search_has_dropped_is_asked_for_beside_the_last_mo
     # no model took it: a triple with two poles left an error of 5.6 and had a dead time, certain, wrong
     said = [(one.effect, one.grade.value, one.unknown) for one in seen.findings((), ())]
     assert said == ([("refractory", "either", True)] if ends else [])
+
+
+@pytest.mark.parametrize(
+    ("cut_off", "error", "grade"),
+    [(True, 1.8, Grade.CERTAIN), (False, 1.8, Grade.EITHER), (False, 0.3, Grade.CERTAIN)],
+)
+def test_an_end_that_comes_by_and_by_is_in_doubt_beside_a_model_that_lacks_something(cut_off, error, grade):
+    """A low-pass of 18 Hz beside a limit of the rate that no model has: a dead time was certain."""
+    details = {"period": 2e-3, "low": 1e-3, "high": 2e-3, "cut_off": cut_off}
+    entry = Signature(name=kinds.DEAD_TIME, answer=Answer.FOUND, sentence="seen", details=details)
+    model = model_of(Sensor().with_effect(EFFECTS["refractory"](period=2e-3)), None)
+    task = SimpleNamespace(added_to=lambda one: (), effects=EFFECTS, evidence=SimpleNamespace(frame_step=0.0))
+    seen, _ = seen_beside_model.settle_dead_time(
+        task, EventsAlone(), SeenEffects((entry,)), None, model, judged(error)
+    )
+    said = seen.findings([Finding("refractory", Grade.STAND_IN)], ())
+    assert [(one.effect, one.grade) for one in said] == [("refractory", grade)]
+
+
+def test_an_end_says_whether_intervals_are_cut_off():
+    modelled = np.sort(np.random.default_rng(1).gamma(3.0, 4e-3, 40_000))
+    sharp = end_of_intervals(modelled[modelled > 5e-3], modelled)
+    assert sharp is not None
+    assert sharp.details["cut_off"]
+    rare = np.random.default_rng(2).random(len(modelled)) < np.clip((modelled - 5e-3) / 1.5e-3, 0, 1)
+    gradual = end_of_intervals(modelled[rare], modelled)
+    assert gradual is not None
+    assert not gradual.details["cut_off"]
 
 
 @pytest.mark.parametrize(
