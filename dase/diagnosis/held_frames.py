@@ -26,7 +26,7 @@ from dase.effects.refractory import Refractory
 from dase.effects.second_order import SecondOrder
 from dase.fitting.data_split import SplitMeasurement
 from dase.fitting.frame_steps import clip_step_of
-from dase.fitting.held_clips import begin_of_events
+from dase.fitting.held_clips import HELD_CLIPS, begin_of_events
 from dase.fitting.held_events import HeldEvents
 from dase.fitting.measurement import Measurement, note_of_held_frames
 from dase.fitting.model import FittedModel, fit_present_model, refit_model, refit_work
@@ -73,10 +73,6 @@ class HeldFrameSettings:
 
     alike: float = 0.5
     """What thresholds differ by with that frame's light, relative to its neighbours', where it is clear."""
-
-    one_threshold: float = 0.005
-    """What thresholds of all pixels differ by, relative, at most, where they have a single one: 0.0000 to
-    0.003 in 15 clips of IEBCS, 0.05 and more where they are drawn or of other simulators."""
 
     repeats: int = 12
     """Simulations that judge."""
@@ -407,9 +403,11 @@ def _sentence_of_memory(
     """
     scene = measurement.scene
     assert isinstance(scene, VideoScene)
+    if frames < 2:
+        return ""
     seen = HeldEvents.of(measurement.compared_events(), scene, most=settings.few)
     later, at_once = (spread_of_thresholds(seen, wait=wait) for wait in (frames, 1))
-    if frames < 2 or not later < min(settings.one_threshold, settings.alike * at_once):
+    if not later < min(HELD_CLIPS.same, settings.alike * at_once):
         return ""
     return (
         f"thresholds of all events are alike if pixels remember the light {frames} frames after one, and "

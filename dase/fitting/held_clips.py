@@ -135,7 +135,7 @@ class HeldClipSettings:
     same: float = 0.005
     """What thresholds of frames differ by, relative, at most, where all events have the time of one, or all
     but noise: 0.0007 and less in three clips of IEBCS without latency, 0.01 and more in 55 of others; 0.002
-    and 0.003 in two of IEBCS with noise, 0.05 and more in 70 of others."""
+    and 0.003 in two of IEBCS with noise, 0.05 and more in 119 of others."""
 
     longest_wait: int = 16
     """Frames from an event to that whose light is remembered, at most."""
