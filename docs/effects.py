@@ -435,8 +435,8 @@ A fit tries the other law, too, and keeps the better, so that with which it begi
 kept to the law that it began with (13e41f6), poles that are alike ended at cutoffs of 219, 213 and 126 Hz
 and thresholds of 0.175, 0.184 and 0.198, at errors of 0.93, 0.35 and 0.30: no error tells that something is
 wrong (what repeats have is 1), and yet thresholds are up to 13 % too low. A diagnosis tries poles that are
-alike alone ([what was tried](diagnosis.md)), so its thresholds have this error beside `second_order` where
-the light goes over decades: fit its sensor again.
+alike alone ([what was tried](diagnosis-log.md#populations-and-descents)), so its thresholds have this error
+beside `second_order` where the light goes over decades: fit its sensor again.
 """
 
 
