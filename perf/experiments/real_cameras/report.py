@@ -297,15 +297,15 @@ edges that move, which make the same; of either too few events are left beside e
 The light of `davis346_cuke_cradle` and `davis240b_evbench1` between their few frames is a guess, and what
 fits it best beside what is certain hangs on little: at 5430f9d the same effects were certain, and with
 four stand-ins, each *either that or something unknown*, errors of 0.63 and 0.99 were left; at 0da8282 two
-of each left 1.2 and 1.8, here two leave 0.96 and 2.1. The dot of `psee_gen31_dot` had a blurred lens,
-*supported*, and one or two poles at 0da8282, which left 1.7 of 95; here noise, a pole and a dead time
-leave 8.1 of 56, none of them announced: what light a dot makes that is in no frame is a guess, too.
+of each left 1.2 and 1.8, at a8d1f3c 0.96 and 2.1, here two leave 1.2 and 2.1. The dot of `psee_gen31_dot`
+has a blurred lens, *supported*, and one or two poles here and at 0da8282, which leave 2.1 and 1.7 of 95; at
+a8d1f3c noise, a pole and a dead time left 8.1 of 56, none of them announced: what light a dot makes that is
+in no frame is a guess, too.
 
-Times are of a core and a half of an AMD EPYC (family 23, model 1), slow ones, with other work beside them
-and with kernels compiled on the way: {times} s. On two cores of an AMD EPYC (family 25, model 17) they
-were 30 to 117 s at 0da8282. At 2323c88 they were 51 to 706 s, on a core of an AMD EPYC (family 25) that
-was shared. Since then pixels and models are fewer far from the floor and where light between frames is a
-guess, and a bus is no rival where the stamps say that it was never busy.
+Times are of two cores of an AMD EPYC (family 25, model 17) with kernels compiled on the way: {times} s. At
+0da8282 they were 30 to 117 s there, at a8d1f3c 78 to 424 s on a core and a half of a slower one (family 23,
+model 1), at 2323c88 51 to 706 s on a shared core. Since then pixels and models are fewer far from the floor
+and where light between frames is a guess, and a bus is no rival where the stamps say that it was never busy.
 
 `noise_iebcs` has ON events alone in the light, 0.06 Hz at 161 and 0.13 Hz at 3,000 lux, beside 9.7 Hz at 0.1
 lux. Two seconds have some 25 of them among the pixels that are compared, and no leak is found. Tried and
