@@ -18,6 +18,7 @@ import numpy as np
 
 from dase.diagnosis.compared_measurement import ComparedMeasurement
 from dase.diagnosis.grading import grade_of, judge_on_report
+from dase.diagnosis.late_light import more_alike_if_late
 from dase.diagnosis.light_between_events import LightBetweenEvents, LightSteps
 from dase.diagnosis.state import DiagnosisTask
 from dase.effects.optics_blur import OpticsBlur
@@ -183,7 +184,11 @@ def lens_between_events(
     errors = tuple(max(seen[at]) ** 2 for at in (best - settings.closer, best, best + settings.closer))
     assert len(errors) == 3
     width = _least_between(1.2 * 2**best, settings.closer, errors)
-    return SeenLens(behind_lens(measurement, width), max(sharp), max(seen[best]))
+    behind = behind_lens(measurement, width)
+    # events behind a very slow low-pass are those of light that looks less sharp
+    if more_alike_if_late(measurement, behind, log_eps=log_eps):
+        return None
+    return SeenLens(behind, max(sharp), max(seen[best]))
 
 
 def rules_out_lens(measurement: Measurement, *, log_eps: float, settings: LensSettings = LENS) -> bool:

@@ -86,9 +86,9 @@ class LateDoubleSettings:
     width: float = 0.9
     """Logarithm of the ninth over the first tenth of the intervals, at most: that of noise is 1 and more."""
 
-    none_later: float = 0.03
+    none_later: float = 0.15
     """Pairs in the two octaves after the last double per pair, at most, where doubles come at any time up to
-    then: 0.001 and none in three clips."""
+    then: none in 17 clips, 0.01 and 0.06 in two beside shot noise, which has pairs of any interval."""
 
     evenly: float = 0.1
     """How far the shares of the pairs up to a time may be off from those of times that are drawn evenly, at

@@ -309,6 +309,21 @@ def find_late_events(
     return _signatures_of(best, at_once, math.exp(steps.brightest), log_eps)
 
 
+def more_alike_if_late(measurement: Measurement, other: Measurement, *, log_eps: float) -> bool:
+    """Return whether late events make steps more alike than another scene does.
+
+    Args:
+        measurement: Its light is known, and not held.
+        other: The same events over another scene, at once.
+        log_eps: Added to intensities before the logarithm.
+    """
+    seen = [LightBetweenEvents.of(one, log_eps=log_eps, settings=LOOKED_AT) for one in (measurement, other)]
+    late, at_once = (None if light is None else _Steps.of(light, LATE_LIGHT) for light in seen)
+    if late is None or at_once is None or not late.are_enough:
+        return False
+    return min(way.differ for way in _ways_of(late, LATE_LIGHT)) < at_once.differ()
+
+
 def _looks_late(steps: _Steps, at_once: float, settings: LateLightSettings) -> bool:
     """Return whether some latency or pole makes steps more alike."""
     delays, poles = settings.quick

@@ -9,7 +9,9 @@ from helpers.brief_diagnosis import NO_LIMITS
 from helpers.frame_simulator import shaken_texture
 
 import dase
+from dase.diagnosis.blurred_lens import behind_lens as through_lens
 from dase.diagnosis.blurred_lens import lens_between_events, rules_out_lens
+from dase.diagnosis.late_light import more_alike_if_late
 from dase.effects import EFFECTS
 from dase.effects.bandwidth import Bandwidth
 from dase.effects.optics_blur import OpticsBlur, blur_weights
@@ -92,6 +94,14 @@ def test_what_makes_steps_differ_is_no_lens(scene, effect):
     sensor = dase.Sensor((effect, EFFECTS["threshold"](on=0.2, off=0.22)))
     events = dase.simulate(scene, sensor, seed=1)
     assert lens_between_events(as_measurement(events, scene), log_eps=1e-3) is None
+
+
+def test_a_low_pass_explains_steps_better_than_a_lens_and_a_lens_better_than_that(scene):
+    sensor = dase.Sensor((EFFECTS["bandwidth"](cutoff=30.0), EFFECTS["threshold"](on=0.2, off=0.22)))
+    slow = as_measurement(dase.simulate(scene, sensor, seed=1), scene)
+    blurred = as_measurement(behind_lens(scene, SIGMA), scene)
+    assert more_alike_if_late(slow, through_lens(slow, SIGMA), log_eps=1e-3)
+    assert not more_alike_if_late(blurred, through_lens(blurred, SIGMA), log_eps=1e-3)
 
 
 BESIDE = {

@@ -60,6 +60,10 @@ def test_doubles_that_come_at_any_time_up_to_one_are_told(clip, longest, polarit
     assert found.details["spread"] == pytest.approx(longest, rel=0.05)
     assert found.details["gap"] == pytest.approx(0.5 * longest, rel=0.05)
     assert found.details["opposite"] == (polarity == "opposite")
+    # noise of pixels that rest has pairs of any interval, but far from as many
+    beside = find_late_doubles(events_of(clip, Shot(rate=3e-3 / longest), doubles), clip)
+    assert beside.found
+    assert beside.details["opposite"] == (polarity == "opposite")
     # long tails come at any time as well, and later
     tail = DoubleEvents(share=0.06, delay=0.0, tail=longest / 2, polarity=polarity)
     assert not find_late_doubles(events_of(clip, tail), clip).found
