@@ -61,7 +61,7 @@ def test_doubles_that_come_at_any_time_up_to_one_are_told(clip, longest, polarit
     assert found.details["gap"] == pytest.approx(0.5 * longest, rel=0.05)
     assert found.details["opposite"] == (polarity == "opposite")
     # noise of pixels that rest has pairs of any interval, but far from as many
-    beside = find_late_doubles(events_of(clip, Shot(rate=3e-3 / longest), doubles), clip)
+    beside = find_late_doubles(events_of(clip, Shot(rate=2e-3 / longest), doubles), clip)
     assert beside.found
     assert beside.details["opposite"] == (polarity == "opposite")
     # long tails come at any time as well, and later
