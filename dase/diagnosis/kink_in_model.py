@@ -15,6 +15,7 @@ from dase.diagnosis.compared_measurement import ComparedMeasurement
 from dase.diagnosis.grading import judge_on_report
 from dase.diagnosis.kinked_response import find_kinked_response
 from dase.diagnosis.state import DiagnosisState, DiagnosisTask
+from dase.diagnosis.steps_in_the_dark import find_current_at_corners
 from dase.effects.linlog import Linlog
 from dase.effects.vignetting import Vignetting
 from dase.fitting.model import FittedModel, refit_model, with_fixed_effect
@@ -84,6 +85,10 @@ def put_kink_in_model(
     if not found and not compared.seen.stamped_late and Vignetting.name not in task.given:
         alike = find_alike_steps(compared.measurement, model.sensor, seed=task.seed)
         found = () if alike is None else alike.at_corners()
+        darker = (
+            None if found else find_current_at_corners(compared.measurement, model.sensor, seed=task.seed)
+        )
+        found = found if darker is None else (darker,)
     makers = [(effect, told) for effect, told in _makers(found) if effect.name in task.effects]
     if not makers:
         return model, None

@@ -8,12 +8,16 @@ pixel and from event to event, and noise and leaks, which add some events to all
 
 What else makes steps differ, frames in step with which all events come, a low-pass or a dead time, does so by
 no such law: it counts only if next to nothing is left of what they differ by, and by one of the two alone.
+
+Where corners get less light than the scene has, the same current is more of it there. So the current that a
+ring of pixels around the middle needs tells how much light reaches it: nothing else of a pixel that sees the
+logarithm does.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -23,13 +27,14 @@ from scipy.optimize import minimize_scalar
 from dase.diagnosis.light_between_events import LightBetweenEvents, LightSteps, StepSettings
 from dase.effects.dark import Dark
 from dase.effects.linlog import Linlog
+from dase.effects.vignetting import Vignetting, square_from_middle
 from dase.errors import InputError
 from dase.fitting.frame_steps import is_held
 from dase.fitting.measurement import Measurement
 from dase.formatting import format_percent
 from dase.probes.random_streams import SimulationStream
 from dase.signatures.chance import NINETY
-from dase.signatures.kinds import LARGER_STEPS_IN_THE_DARK
+from dase.signatures.kinds import CURRENT_AT_CORNERS, LARGER_STEPS_IN_THE_DARK
 from dase.signatures.result import Answer, Signature
 from dase.simulation.sensor import Sensor
 
@@ -102,6 +107,31 @@ class DarkStepSettings:
     known: float = 0.08
     """Error of a size beside chance, relative: light between frames is a guess. Six were 1 to 6 % off."""
 
+    rings: int = 5
+    """Around the middle, with as many steps in each."""
+
+    bins_of_ring: int = 6
+    """Levels of light in each."""
+
+    of_part: int = 60
+    """Steps of either polarity of a group of a ring, at least."""
+
+    current_of_ring: tuple[float, float] = (0.67, 5.0)
+    """Currents of a ring that are looked for, relative to that of all."""
+
+    sure: float = 0.02
+    """Error of the current of a ring beside chance, relative: 0.1 to 0.6 % in five clips whose corners get
+    all light."""
+
+    deviations: float = 5.0
+    """By which rings must differ as with corners that are darker."""
+
+    losses: tuple[float, float] = (0.15, 0.86)
+    """Of light in the corners that are told."""
+
+    known_loss: float = 0.12
+    """Error of a loss: one of 0.33 that grows with the fourth power of the distance was read as 0.26."""
+
     def range_of(self, name: str) -> tuple[float, float]:
         """Return the least and the largest size of a law that is looked for."""
         return self.current if name == "current" else self.knee
@@ -119,23 +149,27 @@ class _Steps:
         after: The same at the later one.
         sign: 1 of ON events, -1 of OFF events.
         block: Of the pixel, shape (N,).
+        square: Of the distance of the pixel from the middle, in units of the corner's, shape (N,).
     """
 
     before: Array
     after: Array
     sign: int
     block: NDArray[np.int64]
+    square: Array
     _levels: dict[int, list[tuple[Array, Array]]] = field(default_factory=dict, init=False, repr=False)
+
+    def select(self, some: NDArray[np.bool_] | slice) -> _Steps:
+        """Return some of them."""
+        return _Steps(self.before[some], self.after[some], self.sign, self.block[some], self.square[some])
 
     def part(self, group: int, groups: int) -> _Steps:
         """Return those of every so many blocks."""
-        mine = self.block % groups == group
-        return _Steps(self.before[mine], self.after[mine], self.sign, self.block[mine])
+        return self.select(self.block % groups == group)
 
     def thinned(self, most: int) -> _Steps:
         """Return so many of them at most, spread evenly."""
-        every = slice(None, None, max(1, -(-len(self.after) // most)))
-        return _Steps(self.before[every], self.after[every], self.sign, self.block[every])
+        return self.select(slice(None, None, max(1, -(-len(self.after) // most))))
 
     def differ(self, response: Callable[[Array], Array], bins: int) -> float:
         """Return what the medians of steps of a response differ by at different levels, relative.
@@ -208,29 +242,10 @@ def find_larger_steps_in_the_dark(
         seed: Of its random numbers.
         settings: When steps are larger.
     """
-    if is_held(measurement.scene):
+    found = _DarkSteps.of(measurement, sensor, settings)
+    if found is None or found.shown_by_model(sensor, seed, settings):
         return None
-    light = LightBetweenEvents.of(measurement, log_eps=sensor.log_eps, settings=LOOKED_AT)
-    if light is None:
-        return None
-    brightest = float(np.quantile(light.level(every=max(1, len(light.times) // 50)), 0.99))
-    width = measurement.scene.width
-    seen = _steps_of(light.seen, brightest, width, settings)
-    law, differ = _law_of(seen, settings), _differ(seen, None, settings)
-    chance = None if law is None else _error_of(seen, law, settings)
-    if law is None or chance is None:
-        return None
-    for name in MAKERS:
-        sensor = sensor.without(name) if name in sensor else sensor
-    try:
-        made = light.of_model(sensor, seed=SimulationStream.STEPS_IN_THE_DARK.seed(seed))
-    except InputError:
-        return None
-    modelled = _steps_of(made, brightest, width, settings)
-    # steps of a model that sends too few, or that differ as much by whatever law, tell nothing
-    if not modelled or _differ(modelled, None, settings) > settings.model * differ:
-        return None
-    unit = math.exp(brightest)
+    law, differ, chance, unit = found.law, found.differ, found.chance, math.exp(found.brightest)
     # light is known with `log_eps` added to it: a current comes on top of that, a knee lies above it
     size = unit * law.size - (sensor.log_eps if law.name == "knee" else 0.0)
     error = math.hypot(NINETY * unit * chance, settings.known * size)
@@ -247,25 +262,180 @@ def find_larger_steps_in_the_dark(
     )  # fmt: skip
 
 
-def _steps_of(steps: LightSteps, brightest: float, width: int, settings: DarkStepSettings) -> list[_Steps]:
-    """Return the steps that count, of ON and OFF events that follow one of the same polarity; none if few."""
+@dataclass(frozen=True)
+class _DarkSteps:
+    """Steps that are larger in the dark.
+
+    Args:
+        light: Of the measurement.
+        brightest: Log intensity of the brightest light.
+        steps: Of either polarity.
+        law: By which they are larger.
+        differ: What their medians differ by at different levels, relative.
+        chance: Standard error of the size of the law, relative to the brightest light.
+    """
+
+    light: LightBetweenEvents
+    brightest: float
+    steps: list[_Steps]
+    law: _Law
+    differ: float
+    chance: float
+
+    @classmethod
+    def of(cls, measurement: Measurement, sensor: Sensor, settings: DarkStepSettings) -> _DarkSteps | None:
+        """Return those of a measurement; None where they are not larger, or by neither law."""
+        if is_held(measurement.scene):
+            return None
+        light = LightBetweenEvents.of(measurement, log_eps=sensor.log_eps, settings=LOOKED_AT)
+        if light is None:
+            return None
+        brightest = float(np.quantile(light.level(every=max(1, len(light.times) // 50)), 0.99))
+        steps = _steps_of(light, light.seen, sensor, brightest, settings)
+        law = _law_of(steps, settings)
+        chance = None if law is None else _error_of(steps, law, settings)
+        if law is None or chance is None:
+            return None
+        return cls(light, brightest, steps, law, _differ(steps, None, settings), chance)
+
+    def shown_by_model(self, sensor: Sensor, seed: int, settings: DarkStepSettings) -> bool:
+        """Return whether a model without current and knee shows half as much, or cannot be simulated."""
+        for name in MAKERS:
+            sensor = sensor.without(name) if name in sensor else sensor
+        try:
+            made = self.light.of_model(sensor, seed=SimulationStream.STEPS_IN_THE_DARK.seed(seed))
+        except InputError:
+            return True
+        # steps of a model that sends too few, or that differ as much by whatever law, tell nothing
+        modelled = _steps_of(self.light, made, sensor, self.brightest, settings)
+        return not modelled or _differ(modelled, None, settings) > settings.model * self.differ
+
+
+def find_current_at_corners(
+    measurement: Measurement, sensor: Sensor, *, seed: int, settings: DarkStepSettings = DARK_STEPS
+) -> Signature | None:
+    """Return the loss of light at the corners by which the current is more of it there; None where it is not.
+
+    Args:
+        measurement: Its light is known, and not held.
+        sensor: The model, without darker corners, a current and a knee.
+        seed: Of its random numbers.
+        settings: When it is.
+    """
+    found = _DarkSteps.of(measurement, sensor, settings)
+    if found is None or found.law.name != "current" or found.shown_by_model(sensor, seed, settings):
+        return None
+    edges = np.quantile(
+        np.concatenate([one.square for one in found.steps]), np.arange(1, settings.rings) / settings.rings
+    )
+    rings = [
+        [one.select(np.searchsorted(edges, one.square) == ring) for one in found.steps]
+        for ring in range(settings.rings)
+    ]
+    told = [_current_of(ring, found.law.size, settings) for ring in rings]
+    currents = np.array([one for one in told if one is not None])
+    if len(currents) < len(rings):
+        return None
+    square = np.array([np.concatenate([one.square for one in ring]).mean() for ring in rings])
+    loss, deviations = _loss_of(square, currents[:, 0], currents[:, 1])
+    low, high = settings.losses
+    if not low <= loss <= high or deviations < settings.deviations:
+        return None
+    sentence = (
+        f"a current without light is the more of the scene's light the nearer a corner is, as if "
+        f"{format_percent(loss)} of it were lost there: {currents[-1, 0] / currents[0, 0]:.2f} times as much "
+        "in the outermost fifth of the steps as in the innermost"
+    )
+    return Signature(
+        name=CURRENT_AT_CORNERS, answer=Answer.FOUND, p=0.0, size=loss,
+        low=max(loss - settings.known_loss, 0.0),
+        high=min(loss + settings.known_loss, 1.0), unit="share of the light", least=low, sentence=sentence,
+        details={"loss": loss},
+    )  # fmt: skip
+
+
+def _current_of(
+    ring: Sequence[_Steps], current: float, settings: DarkStepSettings
+) -> tuple[float, float] | None:
+    """Return the current with which steps of a ring differ least, and its error, relative; None for too few.
+
+    Args:
+        ring: Its steps, of either polarity.
+        current: With which those of all rings do, relative to the brightest light.
+        settings: How it is looked for.
+    """
+    ends = (current * settings.current_of_ring[0], current * settings.current_of_ring[1])
+    parts = [[one.part(n, settings.groups) for one in ring] for n in range(settings.groups)]
+    parts = [part for part in parts if min(len(one.after) for one in part) >= settings.of_part]
+    if 2 * len(parts) < settings.groups:
+        return None
+    whole, *found = (_fit(of, "current", settings, ends, settings.bins_of_ring) for of in (ring, *parts))
+    logs = np.log([one.size for one in found if math.isfinite(one.left)])
+    if not math.isfinite(whole.left) or 2 * len(logs) < settings.groups:
+        return None
+    # few steps of a part may all be of the light, where no current is the better: its current is anywhere
+    spread = 1.4826 * float(np.median(np.abs(logs - np.median(logs))))
+    return whole.size, math.hypot(spread / math.sqrt(len(logs)), settings.sure)
+
+
+def _loss_of(square: Array, currents: Array, errors: Array) -> tuple[float, float]:
+    """Return the loss of light in the corners that currents of rings tell, and by how much [deviations].
+
+    Args:
+        square: Of the distance of rings from the middle, in units of the corner's, shape (R,).
+        currents: With which their steps are alike, shape (R,).
+        errors: Of these, relative, shape (R,).
+    """
+    weights = errors**-2.0
+
+    def off(loss: float) -> float:
+        less = np.log(currents) + np.log(Vignetting(loss=loss).light_at(square))
+        return float((weights * (less - np.average(less, weights=weights)) ** 2).sum())
+
+    found = minimize_scalar(off, bounds=(0.0, 0.95), method="bounded")
+    return float(found.x), math.sqrt(max(off(0.0) - float(found.fun), 0.0))
+
+
+def _steps_of(
+    light: LightBetweenEvents,
+    steps: LightSteps,
+    sensor: Sensor,
+    brightest: float,
+    settings: DarkStepSettings,
+) -> list[_Steps]:
+    """Return the steps that count, of ON and OFF events that follow one of the same polarity; none if few.
+
+    Behind the corners of a sensor that has darker ones.
+    """
+    width = light.measurement.scene.width
     block = steps.blocks(width, settings.block)
+    row, column = np.divmod(steps.pixel, width)
+    square = square_from_middle(column, row + light.rows[0], width, light.measurement.scene.height)
+    less = np.zeros(len(square))
+    for effect in sensor.effects:
+        if isinstance(effect, Vignetting):
+            less = np.log(effect.light_at(square))
     out = []
     for sign in (1, -1):
         counts = steps.counts & steps.again & (steps.gap < settings.longest) & (steps.on == (sign > 0))
         counts &= steps.level - 0.5 * steps.change > brightest + math.log(settings.darkest)
-        after = steps.level[counts] - brightest
+        after = steps.level[counts] - brightest + less[counts]
         if len(after) < settings.steps:
             return []
-        out.append(_Steps(after - steps.change[counts], after, sign, block[counts]))
+        out.append(_Steps(after - steps.change[counts], after, sign, block[counts], square[counts]))
     return out
 
 
-def _differ(steps: list[_Steps], response: Callable[[Array], Array] | None, s: DarkStepSettings) -> float:
+def _differ(
+    steps: Sequence[_Steps],
+    response: Callable[[Array], Array] | None,
+    s: DarkStepSettings,
+    bins: int | None = None,
+) -> float:
     """Return what steps of either polarity differ by at different levels, of a response or the logarithm."""
     if not steps:
         return 0.0
-    return max(one.differ(response or (lambda v: v), s.bins) for one in steps)
+    return max(one.differ(response or (lambda v: v), bins or s.bins) for one in steps)
 
 
 def _law_of(steps: list[_Steps], settings: DarkStepSettings) -> _Law | None:
@@ -280,19 +450,33 @@ def _law_of(steps: list[_Steps], settings: DarkStepSettings) -> _Law | None:
     return best if low * (1 + settings.ends) < best.size < high * (1 - settings.ends) else None
 
 
-def _fit(steps: list[_Steps], name: str, settings: DarkStepSettings) -> _Law:
-    """Return the size of a current or a knee with which steps differ least."""
-    low, high = settings.range_of(name)
+def _fit(
+    steps: Sequence[_Steps],
+    name: str,
+    settings: DarkStepSettings,
+    ends: tuple[float, float] | None = None,
+    bins: int | None = None,
+) -> _Law:
+    """Return the size of a current or a knee with which steps differ least.
 
-    def left(log: float, of: list[_Steps] = steps) -> float:
-        return _differ(of, LAWS[name](math.exp(log)), settings)
+    Args:
+        steps: Of either polarity.
+        name: One of `LAWS`.
+        settings: How it is looked for.
+        ends: Sizes between which it is; None for those of the law.
+        bins: Levels of light; None for as many as usual.
+    """
+    low, high = ends or settings.range_of(name)
+
+    def left(log: float, of: Sequence[_Steps] = steps) -> float:
+        return _differ(of, LAWS[name](math.exp(log)), settings, bins)
 
     # where the least is, few steps tell; what it is, all do
     few = [one.thinned(settings.thinned) for one in steps]
     tried = np.linspace(math.log(low), math.log(high), settings.looks)
     begin = int(np.argmin([left(one, few) for one in tried]))
-    ends = tried[max(begin - 1, 0)], tried[min(begin + 1, len(tried) - 1)]
-    found = minimize_scalar(left, bounds=ends, method="bounded", options={"xatol": 0.01})
+    near = tried[max(begin - 1, 0)], tried[min(begin + 1, len(tried) - 1)]
+    found = minimize_scalar(left, bounds=near, method="bounded", options={"xatol": 0.01})
     at, least = min((left(tried[begin]), float(tried[begin])), (float(found.fun), float(found.x)))[::-1]
     return _Law(name, math.exp(at), least)
 

@@ -14,7 +14,11 @@ import dase
 from dase.diagnosis import seen_beside_model
 from dase.diagnosis.light_between_events import LightBetweenEvents
 from dase.diagnosis.seen_effects import SeenEffects, with_size_that_was_seen
-from dase.diagnosis.steps_in_the_dark import DARK_STEPS, find_larger_steps_in_the_dark
+from dase.diagnosis.steps_in_the_dark import (
+    DARK_STEPS,
+    find_current_at_corners,
+    find_larger_steps_in_the_dark,
+)
 from dase.effects import EFFECTS
 from dase.effects.made_signatures import told_by
 from dase.fitting.measurement import Measurement
@@ -45,6 +49,36 @@ def test_a_current_is_told_whatever_thresholds_do(scene, more):
     assert told_by(entry, EFFECTS) == ("dark",)
     assert entry.details["current"] == entry.size == pytest.approx(0.05, rel=0.08)
     assert entry.low <= 0.05 <= entry.high
+
+
+@pytest.mark.parametrize("loss", [0.35, 0.6])
+@pytest.mark.parametrize("more", [{}, {"leak": {"rate": 1.0}}])
+def test_a_current_that_is_larger_toward_the_corners_tells_how_much_light_they_lose(scene, loss, more):
+    sensor = sensor_with(dark={"current": 0.05}, vignetting={"loss": loss}, **more)
+    measurement = Measurement(dase.simulate(scene, sensor, seed=3), scene)
+    entry = find_current_at_corners(measurement, Sensor(), seed=0)
+    assert told_by(entry, EFFECTS) == ("vignetting",)
+    assert entry.low < loss < entry.high
+    # behind these corners the current is what it is
+    corners = sensor_with(vignetting={"loss": loss})
+    known = find_larger_steps_in_the_dark(measurement, corners, seed=0)
+    assert known.details["current"] == pytest.approx(0.05, rel=0.08)
+
+
+@pytest.mark.parametrize(
+    "effects",
+    [
+        {"dark": {"current": 0.05}},
+        {"dark": {"current": 0.05}, "mismatch": {"spread": 0.1}},
+        {"dark": {"current": 0.05, "spread": 0.3}},
+        {"dark": {"current": 0.05}, "jitter": {"spread": 0.1}},
+        {"vignetting": {"loss": 0.6}},
+        {"linlog": {"knee": 0.2}, "vignetting": {"loss": 0.6}},
+    ],
+)
+def test_corners_are_not_told_where_they_are_as_bright_or_no_current_is_there(scene, effects):
+    events = dase.simulate(scene, sensor_with(**effects), seed=3)
+    assert find_current_at_corners(Measurement(events, scene), Sensor(), seed=0) is None
 
 
 @pytest.mark.parametrize("log_eps", [1e-3, 0.03])
