@@ -22,7 +22,9 @@ from dase.effects.second_order import SecondOrder
 from dase.effects.timestamp import Timestamp
 from dase.effects.vignetting import Vignetting
 from dase.effects.voltage_noise import VoltageNoise
-from dase.fitting.delays_after_frames import DelaysAfterFrames, delays_after_frames
+from dase.events import Events
+from dase.fitting.delays_after_frames import DELAYS, DelaysAfterFrames, delays_after_frames
+from dase.fitting.held_clips import frames_late
 from dase.fitting.held_events import HeldEvents
 from dase.fitting.measurement import Measurement
 from dase.fitting.thresholds_of_frames import DrawnThresholds, thresholds_of_frames
@@ -59,6 +61,9 @@ class ReadingSettings:
 
     even: float = 1.5
     """By how much the early half of the delays may widen with the way: what a low-pass adds does."""
+
+    few: float = 1.5
+    """The same beside, relative, of a bin with one event: it falls with the root of their number."""
 
     cutoff: float = 1e4
     """[Hz] At most, at intensity 1."""
@@ -119,16 +124,31 @@ def with_direct_readings(
     scene = measurement.scene
     if not isinstance(scene, VideoScene) or not measurement.held or measurement.trust is not None:
         return found
-    delays = delays_after_frames(measurement.compared_events(), scene)
-    if delays is None or delays.width() > settings.width:
+    events, waiting = _events_at_their_frames(measurement, scene)
+    frames = int(waiting or 0)
+    delays = delays_after_frames(events, scene, wait=frames + 1)
+    if delays is None or (waiting is None and delays.width() > settings.width):
         return found
-    for effect, sentence, mine in _effects_of(delays.brighter_half(), settings):
+    for effect, sentence, mine in _effects_of(delays.brighter_half(), settings, frames):
         if effect.name not in task.effects or effect.name in task.given:
             continue
-        if isinstance(effect, Latency) and _waits_for_frames(found.sensor, effect, measurement.held):
+        late = isinstance(effect, Latency) and _waits_for_frames(found.sensor, effect, measurement.held)
+        if late and waiting is None:
             continue  # only the search tells by how many frames more events are late
         found = _with_certain(found, effect, sentence, mine)
     return found
+
+
+def _events_at_their_frames(measurement: Measurement, scene: VideoScene) -> tuple[Events, float | None]:
+    """Return the events, earlier by the whole frames that they are late by, and `frames_late`.
+
+    Args:
+        measurement: The events.
+        scene: Its clip.
+    """
+    events = measurement.compared_events()
+    late = frames_late(events, scene)
+    return replace(events, t=events.t - int(late or 0) * measurement.held), late
 
 
 def _waits_for_frames(sensor: Sensor, effect: Latency, gap: float) -> bool:
@@ -152,7 +172,7 @@ def with_drawn_thresholds(
     if Jitter.name in sensor or not isinstance(scene, VideoScene) or measurement.trust is not None:
         return sensor
     assert isinstance(memory, Refractory)
-    seen = HeldEvents.of(measurement.compared_events(), scene)
+    seen = HeldEvents.of(_events_at_their_frames(measurement, scene)[0], scene)
     drawn = thresholds_of_frames(seen, wait=round(memory.period / measurement.held + 0.5))
     if not drawn or not all(_are_drawn_anew(one, settings) for one in drawn.values()):
         return sensor
@@ -214,9 +234,15 @@ def with_jitter_of_events(
 
 
 def _effects_of(
-    delays: DelaysAfterFrames, settings: ReadingSettings
+    delays: DelaysAfterFrames, settings: ReadingSettings, frames: int = 0
 ) -> list[tuple[Effect, str, dict[str, Estimate]]]:
-    """Return the effects that delays show, each with a sentence and its parameters."""
+    """Return the effects that delays show, each with a sentence and its parameters.
+
+    Args:
+        delays: Of events after frames.
+        settings: From which sizes on they are findings.
+        frames: By which events come later than that.
+    """
     out: list[tuple[Effect, str, dict[str, Estimate]]] = []
     (late, slope), groups = delays.line(), delays.of_groups()
     if len(groups) < 3:
@@ -226,12 +252,15 @@ def _effects_of(
     apart = _half_apart(delays, settings)
     near = settings.middle * delays.gap
     in_the_middle = abs(late - 0.5 * delays.gap) <= near and apart[0] <= near
+    late += frames * delays.gap
     if late >= settings.latency and not in_the_middle:
         half = math.hypot(float(errors[0]), settings.known * late)
         sentence = f"events come {format_seconds(late)} after the frame that makes them, in bright light, too"
         mine = {"latency.delay": Estimate(late, late - half, late + half)}
         out.append((Latency(delay=late, light=0.0), sentence, mine))
-    if apart[0] >= settings.jitter and apart.max() <= settings.even * apart.min():
+    # a bin of few events is off by more
+    even = settings.even * (1 + settings.few / math.sqrt(DELAYS.edges[0] * len(delays.late)))
+    if apart[0] >= settings.jitter and apart.max() <= even * apart.min():
         jitter = float(apart.mean())
         each = np.array([_half_apart(one, settings).mean() for one in groups])
         half = math.hypot(NINETY * float(each.std(ddof=1)) / math.sqrt(len(groups)), settings.known * jitter)

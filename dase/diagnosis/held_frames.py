@@ -26,7 +26,7 @@ from dase.effects.refractory import Refractory
 from dase.effects.second_order import SecondOrder
 from dase.fitting.data_split import SplitMeasurement
 from dase.fitting.frame_steps import clip_step_of
-from dase.fitting.held_clips import HELD_CLIPS, begin_of_events
+from dase.fitting.held_clips import HELD_CLIPS, begin_of_events, frames_late
 from dase.fitting.held_events import HeldEvents
 from dase.fitting.measurement import Measurement, note_of_held_frames
 from dase.fitting.model import FittedModel, fit_present_model, refit_model, refit_work
@@ -165,6 +165,10 @@ def with_frame_as_memory(
     """
     if not measurement.held or EFFECT in sensor:
         return sensor
+    assert isinstance(measurement.scene, VideoScene)
+    waiting = frames_late(measurement.compared_events(), measurement.scene)
+    if waiting is not None and waiting > 1:
+        return sensor.with_effect(Refractory(period=(int(waiting) + 0.5) * measurement.held, mode="reset"))
     fewest = fewest_frames(measurement, settings)
     # or it goes on from where it has sent, as often in a frame as that asks for
     waits = [sensor] + [

@@ -240,7 +240,7 @@ def _shortest_turn(phase: Array, share: float) -> tuple[float, float]:
 
 
 def delays_after_frames(
-    events: Events, scene: VideoScene, settings: DelaySettings = DELAYS
+    events: Events, scene: VideoScene, settings: DelaySettings = DELAYS, *, wait: int = 1
 ) -> DelaysAfterFrames | None:
     """Return the delays of the first events of pixels after frames, each held from the one before on.
 
@@ -248,6 +248,7 @@ def delays_after_frames(
         events: In order of time.
         scene: A clip, held or as its frames are written down.
         settings: Which events are looked at.
+        wait: Frames after the one before an event whose light its pixel remembers.
 
     Returns:
         None where there are too few.
@@ -257,8 +258,9 @@ def delays_after_frames(
     frame, pixel, sign = (one[first] for one in (seen.frame, seen.pixel, seen.sign))
     now = seen.level[frame + 1, pixel]
     step = sign * (now - seen.level[frame, pixel])
-    # a pixel that has sent goes on from the light of that frame
-    whole = sign * (now - seen.level[seen.before[first] + 1, pixel])
+    # a pixel that has sent goes on from the light of that frame, or of the one at which its event is out
+    remembered = np.minimum(seen.before[first] + wait, frame)
+    whole = sign * (now - seen.level[remembered, pixel])
     ways, chosen = [], []
     for one in (1.0, -1.0):
         used = np.flatnonzero((sign == one) & (step > settings.change))

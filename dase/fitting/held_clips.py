@@ -9,7 +9,7 @@ with the jump, and behind a low-pass thin out until the next one.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -140,6 +140,16 @@ class HeldClipSettings:
     longest_wait: int = 16
     """Frames from an event to that whose light is remembered, at most."""
 
+    in_phase: float = 0.4
+    """Length of the mean direction of events by their time after a frame, at least, for their memory to be
+    asked where they are late by more than a frame: 0.7 where stamps are off by an eighth of one."""
+
+    few: int = 1_000_000
+    """Intensities, pixels times frames, that tell that, about."""
+
+    latest: int = 9
+    """Frames that they are late by, at most."""
+
     thin_out: tuple[float, float] = (0.5, 0.1)
     """Shares of the events beside those that have the time of a frame that come in its first third, at least,
     and in its last, at most, where latencies are drawn about 0: 0.84 and 0.004 in a clip of IEBCS, 0.71 and
@@ -196,6 +206,8 @@ def holds_frames(events: Events, scene: Scene, settings: HeldClipSettings = HELD
         if begin is None and (even | at_frame).mean() >= settings.at_parts:
             return False
         if begin is None:
+            if frames_late(events, scene, settings) is not None:
+                return True
             return _come_by_their_way(events, scene, phase % 1.0, settings)
     elif at_frame.any() and not _begin_or_thin_out(phase[~at_frame], settings):
         # noise that is drawn at each frame and light that goes from frame to frame, or events at frames that
@@ -223,7 +235,11 @@ def holds_frames(events: Events, scene: Scene, settings: HeldClipSettings = HELD
         ways = np.diff(np.log(light + np.float32(LOG_EPS)), axis=1)
         ways = np.clip(ways, -settings.change, settings.change)[place] * np.where(p[here], 1, -1)[:, None]
         before, after = before + float(ways[:, 0].sum()), after + float(ways[:, 1].sum())
-    return after > settings.sooner * max(before, 0.0)
+    if after > settings.sooner * max(before, 0.0):
+        return True
+    # it may be one that was shown some frames before
+    waiting = frames_late(events, scene, settings)
+    return waiting is not None and waiting >= 1
 
 
 def come_at_even_parts(
@@ -319,6 +335,32 @@ def _remember_frames(events: Events, scene: VideoScene, settings: HeldClipSettin
             return spread < settings.same
         last = spread
     return False
+
+
+def frames_late(events: Events, scene: VideoScene, settings: HeldClipSettings = HELD_CLIPS) -> float | None:
+    """Return how late events are [frames] if one threshold makes them all once that is known; None if not.
+
+    A pixel whose event is late remembers the light of the frame at which it is sent. The frame of an event is
+    looked for from half a frame before the usual time of events on, so that stamps which are off stay
+    within it.
+
+    Args:
+        events: Sorted.
+        scene: Their clip, held or as its frames are written down.
+        settings: How alike thresholds are.
+    """
+    times = scene.frame_times()
+    gap = float(np.median(np.diff(times)))
+    turn = np.exp(2j * np.pi * (events.t - times[0]) / gap).mean() if len(events) else 0.0
+    if abs(turn) < settings.in_phase:
+        return None
+    usual = float(np.angle(turn)) / (2 * np.pi) % 1.0
+    for frames in range(settings.latest):
+        sooner = replace(events, t=events.t - (usual - 0.5 + frames) * gap)
+        seen = HeldEvents.of(sooner, scene, most=settings.few)
+        if spread_of_thresholds(seen, wait=frames + 1) < settings.same:
+            return frames + usual
+    return None
 
 
 def _come_by_their_way(

@@ -141,15 +141,17 @@ def test_pixels_that_are_slower_in_the_corners_tell_of_vignetting(scene, loss):
 
 
 @pytest.mark.slow
-def test_latency_of_more_than_a_frame_is_left_to_the_search(scene):
-    """After which frame an event is late its delay does not tell."""
+def test_a_latency_of_more_than_a_frame_is_told_by_what_pixels_remember(scene):
+    """After which frame an event is late its delay alone does not tell."""
     gap = float(np.diff(scene.sample_times())[0])
-    events = held_with_low_pass(scene, late=1.3 * gap)
+    events = held_with_low_pass(scene, late=2.3 * gap, stamps=0.1 * gap)
     found = diagnosed(events, scene)
-    assert not [
-        one for one in found.findings
-        if one.effect == "latency" and one.parameters["latency.delay"].value < gap
-    ]  # fmt: skip
+    assert {one.effect: one.grade for one in found.findings} == {
+        "latency": Grade.CERTAIN, "timestamp": Grade.CERTAIN,
+    }  # fmt: skip
+    assert found.parameters["latency.delay"].value == pytest.approx(2.3 * gap, rel=0.02)
+    assert found.parameters["timestamp.jitter"].value == pytest.approx(0.1 * gap, rel=0.2)
+    assert found.errors[-1] < 0.5
 
 
 @pytest.mark.parametrize(

@@ -7,12 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from helpers.frame_simulator import HEIGHT, WIDTH, counted_between_frames, shaken_texture
+from helpers.held_pixels import held_with_low_pass
 
 import dase
 from dase.effects import EFFECTS
 from dase.effects.threshold import Threshold
 from dase.events import Events
-from dase.fitting.held_clips import HELD_CLIPS, come_at_even_parts, holds_frames
+from dase.fitting.held_clips import HELD_CLIPS, come_at_even_parts, frames_late, holds_frames
 from dase.fitting.measurement import as_measurement
 from dase.scenes.video import VideoScene
 from dase.simulation.sensor import Sensor
@@ -102,6 +103,20 @@ def test_events_that_are_late_by_different_times_tell_of_held_frames_as_well(sce
     order = np.argsort(t, kind="stable")
     spread = Events(t[order], events.x[order], events.y[order], events.p[order], WIDTH, HEIGHT)
     assert holds_frames(spread, scene) == early
+
+
+@pytest.mark.parametrize("late", [1.4, 2.45, 6.3])
+def test_events_that_are_late_by_some_frames_tell_of_held_frames_by_what_pixels_remember(scene, late):
+    """Stamps that are off by an eighth of a frame put events at any time between two."""
+    gap = float(np.diff(scene.sample_times())[0])
+    events = held_with_low_pass(scene, late=late * gap, stamps=0.12 * gap)
+    assert frames_late(events, scene) == pytest.approx(late, abs=0.02)
+    assert holds_frames(events, scene)
+    # light that goes straight between frames, and pixels that are as late
+    sensor = Sensor((EFFECTS["latency"](delay=late * gap, light=0.0), Threshold(on=0.2, off=0.2)))
+    straight = dase.simulate(scene, sensor, seed=1)
+    assert frames_late(straight, scene) is None
+    assert not holds_frames(straight, scene)
 
 
 def test_a_frame_at_its_own_time_is_not_early(scene):
