@@ -113,6 +113,11 @@ class DarkStepSettings:
     bins_of_ring: int = 6
     """Levels of light in each."""
 
+    left_of_ring: float = 0.1
+    """Share of what medians of a ring differ by that stays beside its current, at most: 0.003 to 0.07 where
+    corners were darker, 0.32 in the middle of a scene in which something else made steps differ there
+    (sealed: a loss of 0.7, certain and wrong)."""
+
     of_part: int = 60
     """Steps of either polarity of a group of a ring, at least."""
 
@@ -122,6 +127,10 @@ class DarkStepSettings:
     sure: float = 0.02
     """Error of the current of a ring beside chance, relative: 0.1 to 0.6 % in five clips whose corners get
     all light."""
+
+    by_chance: float = 0.013
+    """Error of the current of a ring by chance, at most, relative, of half of the rings: where currents
+    differ from pixel to pixel, the few that see most of the dark decide a ring."""
 
     deviations: float = 5.0
     """By which rings must differ as with corners that are darker."""
@@ -337,9 +346,10 @@ def find_current_at_corners(
     if len(currents) < len(rings):
         return None
     square = np.array([np.concatenate([one.square for one in ring]).mean() for ring in rings])
-    loss, deviations = _loss_of(square, currents[:, 0], currents[:, 1])
+    chance = currents[:, 1]
+    loss, deviations = _loss_of(square, currents[:, 0], np.hypot(chance, settings.sure))
     low, high = settings.losses
-    if not low <= loss <= high or deviations < settings.deviations:
+    if not low <= loss <= high or deviations < settings.deviations or np.median(chance) > settings.by_chance:
         return None
     sentence = (
         f"a current without light is the more of the scene's light the nearer a corner is, as if "
@@ -357,7 +367,9 @@ def find_current_at_corners(
 def _current_of(
     ring: Sequence[_Steps], current: float, settings: DarkStepSettings
 ) -> tuple[float, float] | None:
-    """Return the current with which steps of a ring differ least, and its error, relative; None for too few.
+    """Return the current with which steps of a ring differ least, and its error, relative.
+
+    None for too few, and where they differ by something else.
 
     Args:
         ring: Its steps, of either polarity.
@@ -369,13 +381,14 @@ def _current_of(
     parts = [part for part in parts if min(len(one.after) for one in part) >= settings.of_part]
     if 2 * len(parts) < settings.groups:
         return None
-    whole, *found = (_fit(of, "current", settings, ends, settings.bins_of_ring) for of in (ring, *parts))
-    logs = np.log([one.size for one in found if math.isfinite(one.left)])
-    if not math.isfinite(whole.left) or 2 * len(logs) < settings.groups:
+    bins = settings.bins_of_ring
+    whole, *found = (_fit(of, "current", settings, ends, bins) for of in (ring, *parts))
+    if whole.left > settings.left_of_ring * _differ(ring, None, settings, bins):
         return None
-    # few steps of a part may all be of the light, where no current is the better: its current is anywhere
-    spread = 1.4826 * float(np.median(np.abs(logs - np.median(logs))))
-    return whole.size, math.hypot(spread / math.sqrt(len(logs)), settings.sure)
+    logs = np.log([one.size for one in found if math.isfinite(one.left)])
+    if 2 * len(logs) < settings.groups:
+        return None
+    return whole.size, float(np.std(logs, ddof=1)) / math.sqrt(len(logs))
 
 
 def _loss_of(square: Array, currents: Array, errors: Array) -> tuple[float, float]:

@@ -144,8 +144,8 @@ class HeldClipSettings:
     """Length of the mean direction of events by their time after a frame, at least, for their memory to be
     asked where they are late by more than a frame: 0.7 where stamps are off by an eighth of one."""
 
-    few: int = 1_000_000
-    """Intensities, pixels times frames, that tell that, about."""
+    few: int = 20_000
+    """Events that tell that, about: those of the rows with the most of them."""
 
     latest: int = 9
     """Frames that they are late by, at most."""
@@ -355,9 +355,10 @@ def frames_late(events: Events, scene: VideoScene, settings: HeldClipSettings = 
     if abs(turn) < settings.in_phase:
         return None
     usual = float(np.angle(turn)) / (2 * np.pi) % 1.0
+    most = int(len(times) * scene.width * scene.height * min(settings.few / len(events), 1.0))
     for frames in range(settings.latest):
         sooner = replace(events, t=events.t - (usual - 0.5 + frames) * gap)
-        seen = HeldEvents.of(sooner, scene, most=settings.few)
+        seen = HeldEvents.of(sooner, scene, most=most)
         if spread_of_thresholds(seen, wait=frames + 1) < settings.same:
             return frames + usual
     return None
