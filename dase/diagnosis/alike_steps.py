@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from dase.diagnosis.light_between_events import LightBetweenEvents, LightSteps
 from dase.diagnosis.steps_in_the_dark import LAWS, LOOKED_AT, MAKERS
 from dase.effects.dark import Dark
-from dase.effects.vignetting import Vignetting, square_from_middle
+from dase.effects.vignetting import Vignetting
 from dase.errors import InputError
 from dase.fitting.frame_steps import is_held
 from dase.fitting.measurement import Measurement
@@ -228,8 +228,7 @@ def find_alike_steps(
     light = LightBetweenEvents.of(measurement, log_eps=sensor.log_eps, settings=LOOKED_AT)
     if light is None:
         return None
-    brightest = float(np.quantile(light.level(every=max(1, len(light.times) // 50)), 0.99))
-    steps = _steps_of(light, light.seen, brightest, settings)
+    steps = _steps_of(light, light.seen, settings)
     few = [one.thinned(settings.thinned) for one in steps]
     even = _best_of(few, "current", _looks(settings.current, settings), (0.0,), settings)
     if even.times < settings.more:
@@ -239,7 +238,7 @@ def find_alike_steps(
         return None
     even, uneven = _law_of(steps, settings)
     low, high = settings.current
-    if not low < uneven.size < high or _shown_by_model(light, sensor, brightest, even, seed, settings):
+    if not low < uneven.size < high or _shown_by_model(light, sensor, even, seed, settings):
         return None
     is_uneven = (
         uneven.loss >= settings.loss
@@ -248,16 +247,12 @@ def find_alike_steps(
     )
     law = uneven if is_uneven else even
     times = uneven.times / even.times
-    return AlikeSteps(math.exp(brightest) * law.size, even.times, law.loss, times)
+    return AlikeSteps(math.exp(light.brightest) * law.size, even.times, law.loss, times)
 
 
-def _steps_of(
-    light: LightBetweenEvents, steps: LightSteps, brightest: float, settings: AlikeStepSettings
-) -> list[_Steps]:
+def _steps_of(light: LightBetweenEvents, steps: LightSteps, settings: AlikeStepSettings) -> list[_Steps]:
     """Return the steps that count, of ON and OFF events that follow one of the same polarity; none if few."""
-    scene = light.measurement.scene
-    row, column = np.divmod(steps.pixel, scene.width)
-    square = square_from_middle(column, row + light.rows[0], scene.width, scene.height)
+    brightest, square = light.brightest, light.square_from_middle(steps)
     out = []
     for sign in (1, -1):
         counts = steps.counts & steps.again & (steps.gap < settings.longest) & (steps.on == (sign > 0))
@@ -325,7 +320,6 @@ def _law_of(steps: Sequence[_Steps], settings: AlikeStepSettings) -> tuple[_Law,
 def _shown_by_model(
     light: LightBetweenEvents,
     sensor: Sensor,
-    brightest: float,
     law: _Law,
     seed: int,
     settings: AlikeStepSettings,
@@ -335,7 +329,6 @@ def _shown_by_model(
     Args:
         light: Of the rows that are looked at.
         sensor: The model.
-        brightest: Log intensity of the brightest light.
         law: That was found.
         seed: Of the model's random numbers.
         settings: When it does.
@@ -347,6 +340,6 @@ def _shown_by_model(
     except InputError:
         return True
     # steps of a model that sends too few tell nothing
-    modelled = _steps_of(light, made, brightest, settings)
+    modelled = _steps_of(light, made, settings)
     found = _best_of(modelled, "current", (law.size,), (0.0,), settings)
     return not modelled or found.times - 1 > settings.model * (law.times - 1)

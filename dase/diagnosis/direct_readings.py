@@ -124,23 +124,23 @@ def with_direct_readings(
     scene = measurement.scene
     if not isinstance(scene, VideoScene) or not measurement.held or measurement.trust is not None:
         return found
-    events, waiting = _events_at_their_frames(measurement, scene)
-    frames = int(waiting or 0)
+    events, late_by = _events_at_their_frames(measurement, scene)
+    frames = int(late_by or 0)
     delays = delays_after_frames(events, scene, wait=frames + 1)
-    if delays is None or (waiting is None and delays.width() > settings.width):
+    if delays is None or (late_by is None and delays.width() > settings.width):
         return found
     for effect, sentence, mine in _effects_of(delays.brighter_half(), settings, frames):
         if effect.name not in task.effects or effect.name in task.given:
             continue
         late = isinstance(effect, Latency) and _waits_for_frames(found.sensor, effect, measurement.held)
-        if late and waiting is None:
+        if late and late_by is None:
             continue  # only the search tells by how many frames more events are late
         found = _with_certain(found, effect, sentence, mine)
     return found
 
 
 def _events_at_their_frames(measurement: Measurement, scene: VideoScene) -> tuple[Events, float | None]:
-    """Return the events, earlier by the whole frames that they are late by, and `frames_late`.
+    """Return the events, earlier by the whole frames that they are late by, and how late they are [frames].
 
     Args:
         measurement: The events.

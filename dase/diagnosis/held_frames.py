@@ -166,9 +166,10 @@ def with_frame_as_memory(
     if not measurement.held or EFFECT in sensor:
         return sensor
     assert isinstance(measurement.scene, VideoScene)
-    waiting = frames_late(measurement.compared_events(), measurement.scene)
-    if waiting is not None and waiting > 1:
-        return sensor.with_effect(Refractory(period=(int(waiting) + 0.5) * measurement.held, mode="reset"))
+    late_by = frames_late(measurement.compared_events(), measurement.scene)
+    if late_by is not None and late_by > 1:
+        # such a pixel remembers the light of the frame at which its event is out
+        return sensor.with_effect(Refractory(period=(int(late_by) + 0.5) * measurement.held, mode="reset"))
     fewest = fewest_frames(measurement, settings)
     # or it goes on from where it has sent, as often in a frame as that asks for
     waits = [sensor] + [

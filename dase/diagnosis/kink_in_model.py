@@ -85,10 +85,9 @@ def put_kink_in_model(
     if not found and not compared.seen.stamped_late and Vignetting.name not in task.given:
         alike = find_alike_steps(compared.measurement, model.sensor, seed=task.seed)
         found = () if alike is None else alike.at_corners()
-        darker = (
-            None if found else find_current_at_corners(compared.measurement, model.sensor, seed=task.seed)
-        )
-        found = found if darker is None else (darker,)
+        if not found:
+            darker = find_current_at_corners(compared.measurement, model.sensor, seed=task.seed)
+            found = () if darker is None else (darker,)
     makers = [(effect, told) for effect, told in _makers(found) if effect.name in task.effects]
     if not makers:
         return model, None

@@ -9,6 +9,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from dase.effects.vignetting import square_from_middle
 from dase.events import Events
 from dase.fitting.held_events import rows_with_most_events
 from dase.fitting.measurement import Measurement
@@ -118,6 +119,11 @@ class LightBetweenEvents:
         """Rows that are looked at, and columns."""
         return self.rows[1] - self.rows[0], self.measurement.scene.width
 
+    @cached_property
+    def brightest(self) -> float:
+        """Log intensity of the brightest light of the rows but for a hundredth, at some fifty instants."""
+        return float(np.quantile(self.level(every=max(1, len(self.times) // 50)), 0.99))
+
     def level(self, every: int = 1) -> NDArray[np.float32]:
         """Return the log intensity of the pixels of the rows, of every so many instants, shape (T, P)."""
         return log_light_of(
@@ -128,6 +134,16 @@ class LightBetweenEvents:
     def seen(self) -> LightSteps:
         """What light does between the events of the measurement."""
         return self.steps_between(self.measurement.compared_events())
+
+    def square_from_middle(self, steps: LightSteps) -> Array:
+        """Return the square distance of the pixels of steps from the middle, in units of the corner's, (N,).
+
+        Args:
+            steps: In light of these rows.
+        """
+        scene = self.measurement.scene
+        row, column = np.divmod(steps.pixel, scene.width)
+        return square_from_middle(column, row + self.rows[0], scene.width, scene.height)
 
     def of_model(self, sensor: Sensor, *, seed: int) -> LightSteps:
         """Return what light does between the events that a model sends over the same scene.

@@ -27,7 +27,7 @@ from scipy.optimize import minimize_scalar
 from dase.diagnosis.light_between_events import LightBetweenEvents, LightSteps, StepSettings
 from dase.effects.dark import Dark
 from dase.effects.linlog import Linlog
-from dase.effects.vignetting import Vignetting, square_from_middle
+from dase.effects.vignetting import Vignetting
 from dase.errors import InputError
 from dase.fitting.frame_steps import is_held
 from dase.fitting.measurement import Measurement
@@ -254,7 +254,7 @@ def find_larger_steps_in_the_dark(
     found = _DarkSteps.of(measurement, sensor, settings)
     if found is None or found.shown_by_model(sensor, seed, settings):
         return None
-    law, differ, chance, unit = found.law, found.differ, found.chance, math.exp(found.brightest)
+    law, differ, chance, unit = found.law, found.differ, found.chance, math.exp(found.light.brightest)
     # light is known with `log_eps` added to it: a current comes on top of that, a knee lies above it
     size = unit * law.size - (sensor.log_eps if law.name == "knee" else 0.0)
     error = math.hypot(NINETY * unit * chance, settings.known * size)
@@ -277,7 +277,6 @@ class _DarkSteps:
 
     Args:
         light: Of the measurement.
-        brightest: Log intensity of the brightest light.
         steps: Of either polarity.
         law: By which they are larger.
         differ: What their medians differ by at different levels, relative.
@@ -285,7 +284,6 @@ class _DarkSteps:
     """
 
     light: LightBetweenEvents
-    brightest: float
     steps: list[_Steps]
     law: _Law
     differ: float
@@ -299,13 +297,12 @@ class _DarkSteps:
         light = LightBetweenEvents.of(measurement, log_eps=sensor.log_eps, settings=LOOKED_AT)
         if light is None:
             return None
-        brightest = float(np.quantile(light.level(every=max(1, len(light.times) // 50)), 0.99))
-        steps = _steps_of(light, light.seen, sensor, brightest, settings)
+        steps = _steps_of(light, light.seen, sensor, settings)
         law = _law_of(steps, settings)
         chance = None if law is None else _error_of(steps, law, settings)
         if law is None or chance is None:
             return None
-        return cls(light, brightest, steps, law, _differ(steps, None, settings), chance)
+        return cls(light, steps, law, _differ(steps, None, settings), chance)
 
     def shown_by_model(self, sensor: Sensor, seed: int, settings: DarkStepSettings) -> bool:
         """Return whether a model without current and knee shows half as much, or cannot be simulated."""
@@ -316,7 +313,7 @@ class _DarkSteps:
         except InputError:
             return True
         # steps of a model that sends too few, or that differ as much by whatever law, tell nothing
-        modelled = _steps_of(self.light, made, sensor, self.brightest, settings)
+        modelled = _steps_of(self.light, made, sensor, settings)
         return not modelled or _differ(modelled, None, settings) > settings.model * self.differ
 
 
@@ -413,17 +410,14 @@ def _steps_of(
     light: LightBetweenEvents,
     steps: LightSteps,
     sensor: Sensor,
-    brightest: float,
     settings: DarkStepSettings,
 ) -> list[_Steps]:
     """Return the steps that count, of ON and OFF events that follow one of the same polarity; none if few.
 
     Behind the corners of a sensor that has darker ones.
     """
-    width = light.measurement.scene.width
-    block = steps.blocks(width, settings.block)
-    row, column = np.divmod(steps.pixel, width)
-    square = square_from_middle(column, row + light.rows[0], width, light.measurement.scene.height)
+    brightest, square = light.brightest, light.square_from_middle(steps)
+    block = steps.blocks(light.measurement.scene.width, settings.block)
     less = np.zeros(len(square))
     for effect in sensor.effects:
         if isinstance(effect, Vignetting):

@@ -238,8 +238,8 @@ def holds_frames(events: Events, scene: Scene, settings: HeldClipSettings = HELD
     if after > settings.sooner * max(before, 0.0):
         return True
     # it may be one that was shown some frames before
-    waiting = frames_late(events, scene, settings)
-    return waiting is not None and waiting >= 1
+    late_by = frames_late(events, scene, settings)
+    return late_by is not None and late_by >= 1
 
 
 def come_at_even_parts(
