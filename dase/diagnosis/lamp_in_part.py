@@ -99,6 +99,11 @@ class LampSettings:
     from which on each of these is the scene's: pixels that see the same send together, at multiples of its
     rate. 0.99 in a clip whose light goes to and fro at 10 Hz."""
 
+    at_their_times: float = 0.5
+    """Amplitude of a tone in events at their own times, relative to that in counts, at least. In counts of
+    1 ms tones look alike that are whole kHz apart, or add up to such: frames at 640 Hz look like 360 Hz.
+    Lamps have 0.99 and more, that image 0.005."""
+
     most_of_all: float = 0.6
     """Share of the array from which on a lamp lights all of it."""
 
@@ -157,11 +162,13 @@ def find_lamp_in_part(
     scene, events, s = measurement.scene, measurement.compared_events(), settings
     if not isinstance(scene, VideoScene) or len(events) < 2000 or events.t[-1] - events.t[0] < 0.4:
         return None
-    counts = _TileCounts.of(events.select(events.t < events.t[0] + s.longest), s)
+    events = events.select(events.t < events.t[0] + s.longest)
+    counts = _TileCounts.of(events, s)
     blocks = _blocks_of(counts, s)
     lamps = [
         one for one in _likely_tones(counts, blocks, s)
         if _is_lamp(one, clip_step_of(scene), counts.duration, s)
+        and _share_at_their_times(one, counts, events) >= s.at_their_times
     ]  # fmt: skip
     if not lamps:
         return None
@@ -411,6 +418,24 @@ def _is_lamp(tone: _Tone, step: float, duration: float, s: LampSettings) -> bool
         and tone.balanced >= s.balanced * tone.swing
         and part not in (1, 2)  # frames come as often, or are alike in turns
     )
+
+
+def _share_at_their_times(tone: _Tone, counts: _TileCounts, events: Events) -> float:
+    """Return how strong a tone of counts is in events at their own times, relative to the counts.
+
+    Args:
+        tone: Found in the counts.
+        counts: Of the events.
+        events: All of them.
+    """
+    inside = tone.place[counts.tile_of_pixel].ravel()[row_major_pixels(events)]
+    turn = -2j * np.pi * tone.frequency
+    sign = np.where(events.p[inside], 1.0, -1.0)
+    own = np.abs((sign * np.exp(turn * (events.t[inside] - events.t[0]))).sum())
+    net = counts.net[:, tone.place].sum(1, dtype=np.float64)
+    middle = (np.arange(len(net)) + 0.5) * counts.step
+    counted = np.abs(((net - net.mean()) * np.exp(turn * middle)).sum())
+    return float(own / max(counted, 1e-9))
 
 
 def _part_of_frames(frequency: float, step: float, duration: float) -> int:

@@ -1,11 +1,13 @@
 """A lamp that lights a part of the picture is told, and its place is not compared."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 import dase
 from dase.diagnosis import lamp_in_part
-from dase.diagnosis.lamp_in_part import find_lamp_in_part
+from dase.diagnosis.lamp_in_part import LAMP, find_lamp_in_part
 from dase.effects import EFFECTS
 from dase.effects.flicker import Flicker
 from dase.effects.hot import Hot
@@ -90,6 +92,18 @@ def test_a_tone_of_the_frames_or_of_the_light_is_no_lamp(clip):
     scene = VideoScene(np.where(PLACE, bars, frames_at(times)).astype(np.float32), times)
     passing = Measurement(dase.simulate(scene, PIXELS, seed=5), scene)
     assert find_lamp_in_part(passing, log_eps=0.01) is None
+
+
+def test_a_tone_that_counts_alone_have_is_no_lamp(clip):
+    """Frames at 640 Hz looked like a lamp of 360 Hz, certain, in counts of 1 ms."""
+    times = np.arange(0.0, 0.6, 2.5e-4)
+    wave = 1 + 0.4 * np.sin(2 * np.pi * 640.0 * times)
+    light = np.where(PLACE, frames_at(times) * wave[:, None, None].astype(np.float32), frames_at(times))
+    fast = Measurement(dase.simulate(VideoScene(light, times), PIXELS, seed=5), clip)
+    assert find_lamp_in_part(fast, log_eps=0.01) is None
+    counted = find_lamp_in_part(fast, log_eps=0.01, settings=replace(LAMP, at_their_times=0.0))
+    assert counted is not None
+    assert counted.entry.details["frequency"] == pytest.approx(360.0, abs=0.5)
 
 
 def test_where_the_strongest_tone_is_of_the_light_no_other_is_a_lamp(clip, monkeypatch):
