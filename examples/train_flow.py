@@ -33,11 +33,11 @@ print(fitted.sensor)
 # a GPU for a larger network; better ones take 32 to 64 channels, 112x112 pixels, 12000 steps
 device = "cuda" if torch.cuda.is_available() else "cpu"
 torch.set_num_threads(1)  # more gain nothing for networks this small, and lose much on a busy machine
-channels, batch, side, steps = (16, 32, 64, 4000) if device == "cuda" else (8, 16, 48, 1000)
+channels, batch, side, steps = (16, 32, 64, 4000) if device == "cuda" else (8, 8, 48, 2000)
 window = 1 / 120
 network = dase.tasks.EvFlowNet(channels=channels)
 settings = dase.tasks.FlowTraining(
-    steps=steps, window=window, average=0.99, learning_rate=3e-3 if device == "cpu" else 2e-3, device=device
+    steps=steps, window=window, average=0.99, learning_rate=2e-3, device=device
 )
 
 
